@@ -1,0 +1,1 @@
+"""The defocus product's plugins: one file per stage, mathematics in subpackages."""

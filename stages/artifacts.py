@@ -1,0 +1,57 @@
+"""The artifacts that this product's stages exchange: one declaration each, shared by both ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from workbench.stage import Artifact, Resource, recorded_camera, recorded_image
+
+NEAR_IMAGE = recorded_image("near", "sensor focused on the near plane, pattern on")
+FAR_IMAGE = recorded_image("far", "sensor focused on the far plane, pattern on")
+FLAT_IMAGE = recorded_image("flat", "pattern off, on the near sensor's grid").optional()
+NEAR_CAMERA = recorded_camera("near", "intrinsics of the near sensor").optional()
+
+
+def _load_calibration(path: Path) -> Any:
+    from stages.dfd.calibration import Calibration
+
+    return Calibration.load(path)
+
+
+CALIBRATION = Resource(
+    "calibration",
+    doc="both steps of section 3.2",
+    required=False,
+    load=_load_calibration,
+    make="stages.dfd.procedure:Procedure",
+    filename="calibration.npz",
+)
+
+NEAR = Artifact("near", "float32", "H W", "grey levels", "near image")
+FAR = Artifact("far", "float32", "H W", "grey levels", "far image on the near image's grid")
+INTENSITY = Artifact(
+    "intensity", "float32", "H W", "grey levels", "flat image, or stripes averaged out"
+)
+SATURATED = Artifact("saturated", "bool", "H W", "", "at full scale in near or far")
+STRIPES = Artifact("stripes", doc="period and direction of the projected stripes, or None")
+DRIFT = Artifact(
+    "registration_drift_px", doc="root mean square misalignment left over the image, pixels"
+)
+GAIN_DRIFT = Artifact("gain_drift", doc="near over far light, against the calibration; 1 is none")
+
+FOCUS_NEAR = Artifact("focus_near", "float32", "H W", "grey levels", "focus measure, near")
+FOCUS_FAR = Artifact("focus_far", "float32", "H W", "grey levels", "focus measure, far")
+
+DEPTH = Artifact("depth_m", "float32", "H W", "m", "z along the optical axis; NaN where unknown")
+RELATIVE = Artifact(
+    "depth_relative",
+    "float32",
+    "H W",
+    "",
+    "0 at the near end of the working range, 1 at the far end, linear in 1/z; NaN where unknown",
+)
+CONFIDENCE = Artifact("confidence", "float32", "H W", "0..1", "trust in the depth")
+CLOUD = Artifact("cloud_xyz_m", "float32", "N 3", "m", "points in camera_optical_frame")
+CLOUD_NORMALS = Artifact("cloud_normals", "float32", "N 3", "", "unit normals, to the camera")
+CLOUD_INTENSITY = Artifact("cloud_intensity", "float32", "N", "grey levels", "brightness")

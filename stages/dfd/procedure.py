@@ -1,0 +1,559 @@
+"""``workbench calibrate``: both steps of section 3.2 from one recording, with a report.
+
+Step one fits the far-to-near similarity to dot grids where the recording has some, and to the
+image pairs themselves otherwise.  Step two fits, for every pixel, relative depth as a polynomial
+of the focus ratio over planes of known distance.  Frames are read several times and never held:
+what is kept per pixel are the sums of the normal equations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stages.dfd.calibration import Calibration
+from stages.dfd.depth import windows_for
+from stages.dfd.focus import LaplacianKind, SensorNoise, focus_map
+from stages.dfd.images import full_scale, grey
+from stages.dfd.score import PATCH_PX
+from stages.dfd.similarity import (
+    Similarity,
+    find_dots,
+    fit_similarity,
+    match_dots,
+    misalignment_rms_px,
+    refine_similarity,
+    warp_to_near,
+)
+from stages.dfd.stripes import Stripes, measure_stripes, whole_period_taps
+from workbench.stage import StageParameters, knob
+
+_MIN_DOTS = 16
+_ALIGNING_PAIRS = 8
+_PLANE_RMS_MM = 0.5
+_FLATTEST_SLOPE = 0.15
+_MODULATION_TERMS = 5
+_NOISE_LEVELS = 24
+_MIN_PLANES = 5
+
+
+class CalibrateParameters(StageParameters):
+    """The knobs of the procedure."""
+
+    degree: int = knob(
+        4,
+        "Degree of the curve that takes the focus ratio to depth; fewer planes need a lower one.",
+        low=1,
+        high=6,
+        step=1,
+    )
+    neighbourhood_px: int = knob(
+        9,
+        "Side of the window over which neighbouring pixels share their ratios: the curve varies "
+        "slowly over the image, the noise of a plane does not.",
+        low=1,
+        high=65,
+        step=2,
+        unit="px",
+    )
+    smoothing_periods: float = knob(
+        1.4,
+        "Second averaging when ratios are taken; as in the stage depth_cloud.",
+        low=0.2,
+        high=4,
+        step=0.2,
+        unit="stripe periods",
+    )
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """What is remembered of one calibration frame: known inverse depth, and its middle's ratio."""
+
+    index: int
+    z_m: float
+    ratio: float
+
+
+Frames = Callable[[], Iterator[Any]]
+
+
+def calibrate(
+    frames: Frames,
+    rig: dict[str, str],
+    parameters: CalibrateParameters,
+    laplacian: LaplacianKind = "opencv",
+    progress: Callable[[str], None] = lambda _: None,
+) -> Calibration:
+    """The calibration from a recording of planes (and dot grids).
+
+    ``frames`` gives a fresh pass over the recording's frames each time it is called; a plane's
+    distance is its ground truth depth, or ``z`` (millimetres) in its ``meta``.  Raises
+    ``ValueError`` with one line where the recording cannot calibrate.
+    """
+    progress("step 1: registration")
+    similarity, step_one = _register(frames)
+    progress("stripes, light and noise")
+    stripes = _stripes(frames, similarity)
+    gain, gain_spread = _gain(frames, similarity)
+    noise, noise_source = _noise(frames)
+    side = stripes.extent_px()
+    taps = whole_period_taps(side)
+    windows = windows_for(side, parameters.smoothing_periods, 1.0)
+
+    def maps(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Ratio, sum of focus and brightness of a frame, over the windows of depth_cloud."""
+        near, far = _registered(frame, similarity)
+        far = far * np.float32(_light_ratio(near, far) / gain)
+
+        def pooled(image: np.ndarray) -> np.ndarray:
+            energy = focus_map(image, taps, taps, laplacian, noise) ** 2
+            return np.sqrt(_smooth(energy, windows.x_taps))
+
+        a, b = pooled(near), pooled(far)
+        light = _smooth(_smooth(near + far, taps), windows.x_taps)
+        return (a - b) / (a + b + np.float32(1e-6)), a + b, light
+
+    progress("step 2: working range")
+    planes = [_Plane(frame.index, *_middle(z_m, maps(frame)[0])) for frame, z_m in _planes(frames)]
+    near_z_m, far_z_m, range_note = _working_range(planes, rig)
+    used = [p for p in planes if near_z_m - 0.004 <= p.z_m <= far_z_m + 0.004]
+    distances = sorted({round(p.z_m, 5) for p in used})
+    if len(distances) < _MIN_PLANES:
+        raise ValueError(
+            f"expected planes at {_MIN_PLANES} distances or more within the working range, "
+            f"found {len(distances)}"
+        )
+    degree = min(parameters.degree, len(distances) - 2)
+
+    progress("step 2: curve of every pixel")
+    inverse_near, inverse_far = 1 / near_z_m, 1 / far_z_m
+
+    def relative(z_m: np.ndarray) -> np.ndarray:
+        return (1 / z_m - inverse_near) / (inverse_far - inverse_near)
+
+    normal = _NormalEquations(degree)
+    modulation_points: list[tuple[np.ndarray, np.ndarray]] = []
+    patches: list[tuple[float, np.ndarray, np.ndarray]] = []
+    chosen = {p.index for p in used}
+    for frame, z_m in _planes(frames):
+        if frame.index not in chosen:
+            continue
+        ratio, energy, light = maps(frame)
+        target = relative(z_m).astype(np.float32)
+        middle = _middle_slice(ratio.shape)
+        patches.append((float(np.median(z_m[middle])), ratio[middle], target[middle]))
+        some = (slice(None, None, 16), slice(None, None, 16))
+        modulation_points.append((target[some].ravel(), (energy / (light + 1e-6))[some].ravel()))
+        size = (parameters.neighbourhood_px,) * 2
+        normal.add(cv2.blur(ratio, size, borderType=cv2.BORDER_REFLECT_101), target)
+    curve = normal.solve()
+    modulation = _fit_modulation(modulation_points)
+
+    calibration = Calibration(
+        similarity,
+        stripes,
+        laplacian,
+        curve,
+        near_z_m,
+        far_z_m,
+        modulation,
+        noise,
+        gain,
+    )
+    progress("report")
+    stand_off_mm = 500 * (near_z_m + far_z_m)
+    span_mm = 1e3 * (far_z_m - near_z_m)
+    held_out = _held_out(patches, degree, calibration)
+    fit_rms, fit_worst = _fit_residuals(patches, calibration)
+    report = {
+        "registration": step_one,
+        "stripe_period_px": stripes.period_px,
+        "stripe_direction_deg": stripes.angle_deg,
+        "stripe_strength": stripes.strength,
+        "gain_near_over_far": gain,
+        "gain_spread_percent": gain_spread,
+        "noise_read_variance": noise.read_variance,
+        "noise_shot_gain": noise.gain,
+        "noise_floor_grey_levels": math.sqrt(noise.read_variance),
+        "noise_source": noise_source,
+        "planes": len(planes),
+        "planes_used": len(used),
+        "distances": len(distances),
+        "working_range_mm": [1e3 * near_z_m, 1e3 * far_z_m],
+        "working_range_from": range_note,
+        "degree": degree,
+        "fit_rms_mm": fit_rms,
+        "fit_worst_mm": fit_worst,
+        "linearity_percent_of_span": _linearity(used),
+        "held_out_worst_mm": held_out,
+        "held_out_worst_percent_of_stand_off": 100 * held_out / stand_off_mm,
+        "held_out_worst_percent_of_span": 100 * held_out / span_mm,
+    }
+    calibration.report.update(report)
+    return calibration
+
+
+# -- which frames are what ------------------------------------------------------------------------
+
+
+def _is_grid(frame: Any) -> bool:
+    """Whether the frame shows a printed dot grid; one that does not say so has no stripes."""
+    kind = frame.truth.meta.get("kind") if frame.truth is not None else None
+    if kind is not None:
+        return bool(kind == "grid")
+    return measure_stripes(grey(frame.images["near"])) is None
+
+
+def _plane_depth(frame: Any) -> np.ndarray | None:
+    """Depth [H W] in metres of a frame that shows one plane of known distance, else None."""
+    truth = frame.truth
+    if truth is None:
+        return None
+    height, width = frame.images["near"].shape[:2]
+    if truth.depth_m is None:
+        z = truth.meta.get("z")
+        if not isinstance(z, int | float) or truth.meta.get("kind", "plane") != "plane":
+            return None
+        return np.full((height, width), z / 1e3)
+    z_m = truth.depth_m.astype(np.float64)
+    if z_m.shape != (height, width) or not np.isfinite(z_m).all() or z_m.min() <= 0:
+        return None
+    rows, columns = np.mgrid[0:height:8, 0:width:8]
+    design = np.stack([columns.ravel(), rows.ravel(), np.ones(rows.size)], axis=1)
+    target = 1 / z_m[::8, ::8].ravel()
+    fitted = design @ np.linalg.lstsq(design, target, rcond=None)[0]
+    off_mm = 1e3 * (1 / fitted - 1 / target)
+    return z_m if float(np.sqrt((off_mm**2).mean())) < _PLANE_RMS_MM else None
+
+
+def _planes(frames: Frames) -> Iterator[tuple[Any, np.ndarray]]:
+    for frame in frames():
+        z_m = _plane_depth(frame)
+        if z_m is not None and not _is_grid(frame):
+            yield frame, z_m
+
+
+def _registered(frame: Any, similarity: Similarity) -> tuple[np.ndarray, np.ndarray]:
+    return grey(frame.images["near"]), warp_to_near(grey(frame.images["far"]), similarity)
+
+
+def _middle_slice(shape: tuple[int, ...]) -> tuple[slice, slice]:
+    top, left = max(0, (shape[0] - PATCH_PX) // 2), max(0, (shape[1] - PATCH_PX) // 2)
+    return slice(top, top + PATCH_PX), slice(left, left + PATCH_PX)
+
+
+def _middle(z_m: np.ndarray, ratio: np.ndarray) -> tuple[float, float]:
+    middle = _middle_slice(ratio.shape)
+    return float(np.median(z_m[middle])), float(ratio[middle].mean())
+
+
+def _smooth(image: np.ndarray, taps: np.ndarray) -> np.ndarray:
+    return cv2.sepFilter2D(image, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
+
+
+def _light_ratio(near: np.ndarray, far: np.ndarray) -> float:
+    return float(near.sum(dtype=np.float64)) / max(float(far.sum(dtype=np.float64)), 1e-9)
+
+
+# -- step one -------------------------------------------------------------------------------------
+
+
+def _register(frames: Frames) -> tuple[Similarity, dict[str, Any]]:
+    near_points, far_points = [], []
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    seen, stride = 0, 1
+    size = (0, 0)
+    for frame in frames():
+        near, far = grey(frame.images["near"]), grey(frame.images["far"])
+        if near.shape != far.shape:
+            raise ValueError(f"frame {frame.index}: near is {near.shape}, far is {far.shape}")
+        height, width = near.shape
+        if size not in ((0, 0), (width, height)):
+            raise ValueError(
+                f"frame {frame.index}: {width}×{height} pixels after {size[0]}×{size[1]}"
+            )
+        size = (width, height)
+        if _is_grid(frame):
+            matched = match_dots(find_dots(near), find_dots(far))
+            if len(matched[0]) >= _MIN_DOTS:
+                near_points.append(matched[0])
+                far_points.append(matched[1])
+        elif seen % stride == 0:
+            # A few frames, spread over a recording whose length is not known: whenever there
+            # are too many, every other one is dropped and the stride doubled.
+            pairs.append((near, far))
+            if len(pairs) > _ALIGNING_PAIRS:
+                pairs, stride = pairs[::2], 2 * stride
+        seen += 1
+    if seen == 0:
+        raise ValueError("the recording has no frame with both a near and a far image")
+    width, height = size
+    start = Similarity.identity(width, height)
+    if near_points:
+        fit = fit_similarity(np.concatenate(near_points), np.concatenate(far_points), width, height)
+        similarity = fit.similarity
+        report = _describe(fit.similarity) | {
+            "from": f"{len(near_points)} dot grids, {fit.points} dots",
+            "residual_rms_px": fit.residual_rms_px,
+            "before_rms_px": fit.before_rms_px,
+            "residual_each_px": [
+                _apart(similarity, a, b) for a, b in zip(near_points, far_points, strict=True)
+            ],
+        }
+    else:
+        similarity = refine_similarity(pairs, start)
+        before = [misalignment_rms_px(near, far) for near, far in pairs]
+        after = [misalignment_rms_px(near, warp_to_near(far, similarity)) for near, far in pairs]
+        report = _describe(similarity) | {
+            "from": f"{len(pairs)} image pairs",
+            "residual_rms_px": _root_mean_square(after),
+            "before_rms_px": _root_mean_square(before),
+        }
+    return similarity, report
+
+
+def _describe(similarity: Similarity) -> dict[str, Any]:
+    return {
+        "scale": similarity.scale,
+        "rotation_deg": similarity.rotation_deg,
+        "dx_px": similarity.dx_px,
+        "dy_px": similarity.dy_px,
+    }
+
+
+def _apart(similarity: Similarity, near: np.ndarray, far: np.ndarray) -> float:
+    mapped = np.column_stack([near, np.ones(len(near))]) @ similarity.far_from_near.T
+    return _root_mean_square(np.linalg.norm(mapped - far, axis=1))
+
+
+def _root_mean_square(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# -- stripes, light and noise ---------------------------------------------------------------------
+
+
+def _stripes(frames: Frames, similarity: Similarity) -> Stripes:
+    """Median period and direction over the planes, measured where the pattern is sharper."""
+    found = []
+    for frame, _ in _planes(frames):
+        near, far = _registered(frame, similarity)
+        both = [s for s in (measure_stripes(near), measure_stripes(far)) if s is not None]
+        if both:
+            found.append(max(both, key=lambda s: s.strength))
+    if not found:
+        raise ValueError(
+            "the recording has no plane of known distance with stripes on it "
+            "(needs /ground_truth/depth, or z in /ground_truth/meta)"
+        )
+    upright = np.median([abs(s.angle_deg) <= 45 for s in found]) > 0.5
+    # Directions of level stripes straddle the ends of (-90, 90], so they are turned first.
+    angles = [s.angle_deg if upright else s.angle_deg % 180 for s in found]
+    angle = float(np.median(angles))
+    return Stripes(
+        float(np.median([s.period_px for s in found])),
+        angle - 180 if angle > 90 else angle,
+        float(np.median([s.strength for s in found])),
+    )
+
+
+def _gain(frames: Frames, similarity: Similarity) -> tuple[float, float]:
+    """Median ratio of all light, near over far, and its spread (standard deviation) in percent."""
+    ratios = [_light_ratio(*_registered(frame, similarity)) for frame, _ in _planes(frames)]
+    middle = float(np.median(ratios))
+    return middle, 100 * float(np.std(ratios)) / middle
+
+
+def _noise(frames: Frames) -> tuple[SensorNoise, str]:
+    """Photon transfer: variance against grey level, from successive shots of one plane.
+
+    Half the variance of the difference of two shots is the temporal variance of one; grey levels
+    are binned, and a line with weights fitted.  Where no plane was shot twice, the variance of
+    quantisation alone is taken.
+    """
+    level_sum = np.zeros(_NOISE_LEVELS)
+    square_sum = np.zeros(_NOISE_LEVELS)
+    count = np.zeros(_NOISE_LEVELS)
+    before: tuple[float, dict[str, np.ndarray]] | None = None
+    top = 0.0
+    for frame, z_m in _planes(frames):
+        z = float(z_m.mean())
+        images = {c: frame.images[c] for c in ("near", "far")}
+        if before is not None and abs(before[0] - z) < 1e-6:
+            top = top or full_scale(*images.values())
+            if not math.isfinite(top):
+                top = max(float(np.nanmax(image)) for image in images.values())
+            for channel, image in images.items():
+                a, b = grey(image), grey(before[1][channel])
+                mean, difference = (a + b) / 2, a - b
+                usable = (mean < 0.95 * top) & (mean > 0)
+                bins = (mean[usable] / top * _NOISE_LEVELS).astype(int)
+                bins = np.minimum(bins, _NOISE_LEVELS - 1)
+                count += np.bincount(bins, minlength=_NOISE_LEVELS)
+                level_sum += np.bincount(bins, mean[usable], minlength=_NOISE_LEVELS)
+                square_sum += np.bincount(bins, difference[usable] ** 2, minlength=_NOISE_LEVELS)
+        before = (z, images)
+    good = count > 500
+    if int(good.sum()) < 2:
+        return SensorNoise(), "quantisation only: no plane was shot twice"
+    level, variance = level_sum[good] / count[good], square_sum[good] / count[good] / 2
+    design = np.stack([np.ones_like(level), level], axis=1)
+    weight = np.sqrt(count[good]) / variance
+    read, gain = np.linalg.lstsq(design * weight[:, None], variance * weight, rcond=None)[0]
+    return (
+        SensorNoise(max(float(read), 1 / 12), max(float(gain), 0.0)),
+        f"{int(count.sum()) // 1000} thousand pixel pairs of repeated shots",
+    )
+
+
+# -- step two -------------------------------------------------------------------------------------
+
+
+def _working_range(planes: list[_Plane], rig: dict[str, str]) -> tuple[float, float, str]:
+    """The longest run of distances over which the ratio falls steadily, within the focal planes.
+
+    Where the recording's ``rig`` names the focal planes (``u1``, ``u2``, millimetres) the range
+    ends there: beyond them the same ratio means two distances.
+    """
+    if len(planes) < _MIN_PLANES:
+        raise ValueError(
+            f"expected {_MIN_PLANES} planes of known distance or more, found {len(planes)}"
+        )
+    by_distance: dict[float, list[float]] = {}
+    for plane in planes:
+        by_distance.setdefault(round(plane.z_m, 5), []).append(plane.ratio)
+    z = np.array(sorted(by_distance))
+    ratio = np.array([np.mean(by_distance[d]) for d in z])
+    if len(z) < _MIN_PLANES:
+        raise ValueError(f"expected planes at {_MIN_PLANES} distances or more, found {len(z)}")
+    slope = -np.diff(ratio) / np.diff(1 / z)
+    falling = -slope * np.sign(np.median(-slope))
+    steady = falling > _FLATTEST_SLOPE * float(np.median(np.abs(slope)))
+    start = best_start = best_end = 0
+    for i in range(len(steady) + 1):
+        if i == len(steady) or not steady[i]:
+            if i - start > best_end - best_start:
+                best_start, best_end = start, i
+            start = i + 1
+    low, high = float(z[best_start]), float(z[best_end])
+    note = "steady part of the ratio over the planes"
+    try:
+        u1, u2 = sorted((float(rig["u1"]) / 1e3, float(rig["u2"]) / 1e3))
+    except (KeyError, ValueError):
+        u1, u2 = low, high
+    if u1 > low or u2 < high:
+        note += ", within the rig's focal planes"
+    return max(low, u1), min(high, u2), note
+
+
+class _NormalEquations:
+    """Per-pixel least squares of a polynomial, held as sums over the planes."""
+
+    def __init__(self, degree: int) -> None:
+        self.degree = degree
+        self.powers: np.ndarray | None = None
+        self.products: np.ndarray | None = None
+
+    def add(self, ratio: np.ndarray, target: np.ndarray) -> None:
+        if self.powers is None or self.products is None:
+            self.powers = np.zeros((2 * self.degree + 1, *ratio.shape))
+            self.products = np.zeros((self.degree + 1, *ratio.shape))
+        power = np.ones(ratio.shape)
+        for k in range(2 * self.degree + 1):
+            self.powers[k] += power
+            if k <= self.degree:
+                self.products[k] += power * target
+            power *= ratio
+
+    def solve(self) -> np.ndarray:
+        """Coefficients, lowest power first, float32 [degree + 1 H W]."""
+        assert self.powers is not None and self.products is not None
+        terms = self.degree + 1
+        shape = self.products.shape[1:]
+        curve = np.empty((terms, *shape), np.float32)
+        order = np.add.outer(np.arange(terms), np.arange(terms))
+        for row in range(shape[0]):
+            matrix = np.moveaxis(self.powers[:, row][order], -1, 0)
+            matrix = matrix + 1e-9 * np.eye(terms)
+            right = self.products[:, row].T[..., None]
+            curve[:, row] = np.linalg.solve(matrix, right)[..., 0].T
+        return curve
+
+
+def _fit_modulation(points: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    t = np.concatenate([p[0] for p in points]).astype(np.float64)
+    shown = np.concatenate([p[1] for p in points]).astype(np.float64)
+    terms = min(_MODULATION_TERMS, len(points))
+    design = np.vander(np.clip(t, 0, 1), terms, increasing=True)
+    return np.linalg.lstsq(design, shown, rcond=None)[0].astype(np.float32)
+
+
+# -- the report -----------------------------------------------------------------------------------
+
+
+def _held_out(
+    patches: list[tuple[float, np.ndarray, np.ndarray]], degree: int, calibration: Calibration
+) -> float:
+    """Worst error (mm) in the middle 32×32 of planes that their own curve has not seen.
+
+    Each distance between the first and the last is left out in turn (all its shots), and the
+    middle's curves are fitted to the others, just as the calibration itself is.
+    """
+    distances = sorted({round(z, 5) for z, _, _ in patches})
+    worst = 0.0
+    for left_out in distances[1:-1]:
+        normal = _NormalEquations(degree)
+        for z, ratio, target in patches:
+            if round(z, 5) != left_out:
+                normal.add(cv2.blur(ratio, (9, 9), borderType=cv2.BORDER_REFLECT_101), target)
+        curve = normal.solve()
+        for z, ratio, target in patches:
+            if round(z, 5) == left_out:
+                error_mm = 1e3 * (
+                    calibration.z_m(_evaluate(curve, ratio)) - calibration.z_m(target)
+                )
+                worst = max(worst, float(np.abs(error_mm).max()))
+    return worst
+
+
+def _fit_residuals(
+    patches: list[tuple[float, np.ndarray, np.ndarray]], calibration: Calibration
+) -> tuple[float, float]:
+    """Root mean square and worst residual (mm) of the fit in the middle 32×32 of each plane."""
+    squares, pixels, worst = 0.0, 0, 0.0
+    for _, ratio, target in patches:
+        curve = calibration.curve[:, *_middle_slice(calibration.curve.shape[1:])]
+        t = _evaluate(curve, ratio)
+        error_mm = 1e3 * (calibration.z_m(t) - calibration.z_m(target)).astype(np.float64)
+        squares += float((error_mm**2).sum())
+        pixels += error_mm.size
+        worst = max(worst, float(np.abs(error_mm).max()))
+    return math.sqrt(squares / pixels), worst
+
+
+def _evaluate(curve: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    value = curve[-1].copy()
+    for coefficient in curve[-2::-1]:
+        value = value * ratio + coefficient
+    return value
+
+
+def _linearity(planes: list[_Plane]) -> float:
+    """Greatest departure of the ratio from a straight line over 1/z, percent of its span."""
+    inverse = np.array([1 / p.z_m for p in planes])
+    ratio = np.array([p.ratio for p in planes])
+    line = np.polynomial.Polynomial.fit(inverse, ratio, 1)
+    return 100 * float(np.abs(line(inverse) - ratio).max() / np.ptp(ratio))
+
+
+class Procedure:
+    """What ``workbench calibrate`` runs for this product."""
+
+    Parameters = CalibrateParameters
+    run = staticmethod(calibrate)

@@ -1,0 +1,291 @@
+"""Step one of the calibration (section 3.2): the far image onto the near image's pixel grid.
+
+The two sensors see the scene at magnifications that differ by s1/s2, and are never mounted
+exactly alike, so the far image is mapped by a similarity.  The paper turns the screws of a
+multi-axis translator; here the residual misalignment is measured and resampled away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+_MATCH_ROUNDS = 3
+_OUTLIER_SIGMAS = 4.0
+_SMALLEST_FOR_DRIFT_PX = 32
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """x_far = scale · R(rotation) · (x_near - centre) + centre + (dx, dy), in pixels.
+
+    ``rotation_deg`` is counter-clockwise as displayed; ``centre`` is the image's middle, so that
+    the four numbers are nearly independent of one another.
+    """
+
+    scale: float
+    rotation_deg: float
+    dx_px: float
+    dy_px: float
+    width: int
+    height: int
+
+    @staticmethod
+    def identity(width: int, height: int) -> Similarity:
+        return Similarity(1.0, 0.0, 0.0, 0.0, width, height)
+
+    @property
+    def far_from_near(self) -> np.ndarray:
+        """The map as a 2×3 matrix on (x, y, 1)."""
+        a, b = self._ab
+        cx, cy = (self.width - 1) / 2, (self.height - 1) / 2
+        return np.array(
+            [
+                [a, b, cx + self.dx_px - a * cx - b * cy],
+                [-b, a, cy + self.dy_px + b * cx - a * cy],
+            ]
+        )
+
+    @property
+    def _ab(self) -> tuple[float, float]:
+        turn = math.radians(self.rotation_deg)
+        return self.scale * math.cos(turn), self.scale * math.sin(turn)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it moves no pixel of the image by as much as a thousandth of a pixel."""
+        corners = np.array([[0, 0, 1], [self.width - 1, self.height - 1, 1]], float).T
+        return bool(np.abs(self.far_from_near @ corners - corners[:2]).max() < 1e-3)
+
+    @staticmethod
+    def from_ab(a: float, b: float, dx: float, dy: float, width: int, height: int) -> Similarity:
+        """From a = scale·cos, b = scale·sin and the shift of the image's middle."""
+        return Similarity(math.hypot(a, b), math.degrees(math.atan2(b, a)), dx, dy, width, height)
+
+
+def warp_to_near(far: np.ndarray, similarity: Similarity) -> np.ndarray:
+    """``far`` [H W] resampled onto the near image's grid, float32 [H W].
+
+    Lanczos over 8×8 pixels: a bilinear warp blurs the image by a measurable amount, and blur
+    is what this sensor measures.  An identity is passed through untouched.  The border is
+    mirrored, so that no dark frame is read as an edge.
+    """
+    if similarity.is_identity:
+        return far.astype(np.float32, copy=False)
+    return cv2.warpAffine(
+        far.astype(np.float32, copy=False),
+        similarity.far_from_near,
+        (similarity.width, similarity.height),
+        flags=cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+
+
+# -- from dot grids --------------------------------------------------------------------------------
+
+
+def find_dots(image: np.ndarray) -> np.ndarray:
+    """Centres (x, y) of the bright dots on a dark ground in ``image`` [H W], float64 [N 2].
+
+    Dots are the connected parts above the middle between ground and mark (Otsu); the centre is
+    the centroid of the grey levels above the local ground, which a symmetric blur does not
+    move.  Dots cut by the border or of an odd size are left out.  N may be 0.
+    """
+    values = image.astype(np.float32)
+    top = float(values.max())
+    if top <= 0:
+        return np.zeros((0, 2))
+    bytes_ = np.clip(values * (255 / top), 0, 255).astype(np.uint8)
+    _, mask = cv2.threshold(bytes_, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    if count < 2:
+        return np.zeros((0, 2))
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    usual = float(np.median(areas))
+    margin = max(2, round(math.sqrt(usual) / 2) + 1)
+    height, width = values.shape
+    centres = []
+    for x, y, w, h, area in stats[1:]:
+        x0, y0, x1, y1 = x - margin, y - margin, x + w + margin, y + h + margin
+        if not 0.4 * usual <= area <= 2.5 * usual:
+            continue
+        if x0 < 0 or y0 < 0 or x1 > width or y1 > height:
+            continue
+        patch = values[y0:y1, x0:x1]
+        rim = np.concatenate([patch[0], patch[-1], patch[1:-1, 0], patch[1:-1, -1]])
+        weight = np.clip(patch - np.median(rim), 0, None)
+        total = float(weight.sum())
+        if total <= 0:
+            continue
+        ys, xs = np.mgrid[y0:y1, x0:x1]
+        centres.append((float((weight * xs).sum()) / total, float((weight * ys).sum()) / total))
+    return np.array(centres).reshape(-1, 2)
+
+
+def match_dots(near: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of mutually nearest dots, after removing the common drift: two arrays [M 2].
+
+    Dots sit on a lattice, so a pair is only believed within a third of the lattice's pitch.
+    """
+    if len(near) < 4 or len(far) < 4:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    pitch = float(np.median(_nearest(near, near, skip_self=True)[1]))
+    moved = far
+    pairs = np.zeros((0, 2), int)
+    for _ in range(_MATCH_ROUNDS):
+        forward, distance = _nearest(near, moved)
+        backward, _ = _nearest(moved, near)
+        mutual = np.flatnonzero(
+            (backward[forward] == np.arange(len(near))) & (distance < pitch / 3)
+        )
+        if len(mutual) < 4:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        pairs = np.stack([mutual, forward[mutual]], axis=1)
+        design = np.column_stack([far[pairs[:, 1]], np.ones(len(pairs))])
+        solution, *_ = np.linalg.lstsq(design, near[pairs[:, 0]], rcond=None)
+        moved = np.column_stack([far, np.ones(len(far))]) @ solution
+    return near[pairs[:, 0]], far[pairs[:, 1]]
+
+
+@dataclass(frozen=True)
+class SimilarityFit:
+    """A fitted similarity, with the root mean square of what it leaves and how many points."""
+
+    similarity: Similarity
+    residual_rms_px: float
+    points: int
+    before_rms_px: float
+    """Root mean square misalignment with no registration at all."""
+
+
+def fit_similarity(near: np.ndarray, far: np.ndarray, width: int, height: int) -> SimilarityFit:
+    """Least-squares similarity that takes points ``near`` [M 2] to ``far`` [M 2].
+
+    Points further off than four robust standard deviations are left out, once.  Raises
+    ``ValueError`` with fewer than 4 points.
+    """
+    if len(near) < 4:
+        raise ValueError(f"expected at least 4 matched points, found {len(near)}")
+    centre = np.array([(width - 1) / 2, (height - 1) / 2])
+    keep = np.ones(len(near), bool)
+    for last in (False, True):
+        x, y = (near[keep] - centre).T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        design = np.concatenate([np.stack([x, y, one, zero], 1), np.stack([y, -x, zero, one], 1)])
+        target = (far[keep] - centre).T.ravel()
+        a, b, dx, dy = np.linalg.lstsq(design, target, rcond=None)[0]
+        fitted = Similarity.from_ab(float(a), float(b), float(dx), float(dy), width, height)
+        mapped = np.column_stack([near, np.ones(len(near))]) @ fitted.far_from_near.T
+        off = np.linalg.norm(mapped - far, axis=1)
+        if not last:
+            spread = 1.4826 * float(np.median(off)) + 1e-6
+            kept = off < _OUTLIER_SIGMAS * spread
+            keep = kept if int(kept.sum()) >= 4 else keep
+    before = np.linalg.norm(near[keep] - far[keep], axis=1)
+    return SimilarityFit(
+        fitted,
+        float(np.sqrt((off[keep] ** 2).mean())),
+        int(keep.sum()),
+        float(np.sqrt((before**2).mean())),
+    )
+
+
+def _nearest(
+    points: np.ndarray, others: np.ndarray, skip_self: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.spatial import cKDTree
+
+    distance, index = cKDTree(others).query(points, k=2 if skip_self else 1)
+    return (index[:, 1], distance[:, 1]) if skip_self else (index, distance)
+
+
+# -- from the images themselves --------------------------------------------------------------------
+
+
+def refine_similarity(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    start: Similarity,
+    iterations: int = 12,
+) -> Similarity:
+    """The similarity that best aligns image pairs ``(near, far)`` [H W], by Gauss-Newton.
+
+    Both images of a pair are smoothed alike and brought to equal local contrast, so that what
+    is left of the difference in blur is even and does not pull on the (odd) gradients.  A
+    direction that no pair shows (along the stripes of bare planes) keeps its value in
+    ``start``: the normal equations are solved by truncated eigenvalues.
+    """
+    prepared = [(_equalised(near), _equalised(far)) for near, far in pairs]
+    width, height = start.width, start.height
+    ys, xs = np.mgrid[0:height, 0:width].astype(np.float32)
+    xs -= (width - 1) / 2
+    ys -= (height - 1) / 2
+    inner = np.zeros((height, width), bool)
+    margin = max(4, round(0.04 * min(width, height)))
+    inner[margin:-margin, margin:-margin] = True
+    half = min(width, height) / 2
+    current = start
+    for _ in range(iterations):
+        normal = np.zeros((4, 4))
+        right = np.zeros(4)
+        for near, far in prepared:
+            warped = warp_to_near(far, current)
+            mean = 0.5 * (warped + near)
+            gx = cv2.Sobel(mean, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+            gy = cv2.Sobel(mean, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+            columns = [gx * xs + gy * ys, gx * ys - gy * xs, gx, gy]
+            columns[0] /= half
+            columns[1] /= half
+            jacobian = np.stack([c[inner] for c in columns], axis=1).astype(np.float64)
+            residual = (near - warped)[inner].astype(np.float64)
+            normal += jacobian.T @ jacobian
+            right += jacobian.T @ residual
+        values, vectors = np.linalg.eigh(normal)
+        good = values > 1e-2 * values[-1]
+        step = vectors[:, good] @ ((vectors[:, good].T @ right) / values[good])
+        a, b = current._ab
+        current = Similarity.from_ab(
+            a + step[0] / half,
+            b + step[1] / half,
+            current.dx_px + step[2],
+            current.dy_px + step[3],
+            width,
+            height,
+        )
+        if np.abs(step).max() < 1e-4:
+            break
+    return current
+
+
+def _equalised(image: np.ndarray) -> np.ndarray:
+    """``image`` less its local mean, over its local contrast; float32."""
+    values = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)
+    size = max(9, (min(image.shape) // 12) | 1)
+    centred = values - cv2.blur(values, (size, size))
+    contrast = np.sqrt(cv2.blur(centred * centred, (size, size)))
+    return centred / (contrast + 0.02 * float(contrast.max()) + 1e-6)
+
+
+def misalignment_rms_px(near: np.ndarray, far: np.ndarray) -> float:
+    """Root mean square misalignment that is left between two registered images [H W], pixels.
+
+    One Gauss-Newton step away from no motion, taken as the root mean square over the image of
+    the motion that it asks for.  Directions that the images do not show count as aligned; an
+    image without contrast gives 0.
+    """
+    height, width = near.shape
+    if min(height, width) < _SMALLEST_FOR_DRIFT_PX:
+        return 0.0
+    start = Similarity.identity(width, height)
+    step = refine_similarity([(near, far)], start, iterations=1)
+    # Over a rectangle the mean square of a linear map equals that over its four points at
+    # 1/√3 of the half sides.
+    middle = np.array([(width - 1) / 2, (height - 1) / 2])
+    signs = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    points = np.column_stack([middle + signs * middle / math.sqrt(3), np.ones(4)])
+    motion = points @ step.far_from_near.T - points[:, :2]
+    rms = float(np.sqrt((motion**2).sum(axis=1).mean()))
+    return rms if math.isfinite(rms) else 0.0

@@ -1,0 +1,127 @@
+"""Stage ``focus_maps``: how sharp the stripes are in each image (section 3.1)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from stages.artifacts import CALIBRATION, FAR, FOCUS_FAR, FOCUS_NEAR, NEAR, STRIPES
+from workbench.stage import (
+    WARNINGS,
+    Finding,
+    Inputs,
+    Logged,
+    Outputs,
+    Stage,
+    StageParameters,
+    knob,
+)
+
+
+class FocusMaps(Stage):
+    """Energy behind a 5×5 Laplacian, over a window of whole stripe periods, for both images.
+
+    Where the near map is the stronger, the surface is nearer to the near focal plane.
+    """
+
+    name = "focus_maps"
+    needs = (NEAR, FAR, STRIPES, CALIBRATION)
+    gives = (FOCUS_NEAR, FOCUS_FAR)
+
+    class Parameters(StageParameters):
+        laplacian: Literal["opencv", "paper"] = knob(
+            "opencv",
+            "Coefficients of the 5×5 Laplacian, which the paper does not print: OpenCV's passes "
+            "less noise; `paper` is the tight kernel. Calibrate with the one you use.",
+        )
+        window_periods: int = knob(
+            1,
+            "Side of the window in stripe periods: a whole number, or the stripes' ripple is "
+            "read as depth.",
+            low=1,
+            high=6,
+            step=1,
+            unit="stripe periods",
+        )
+        window_px: float = knob(
+            9,
+            "Side of the window where no stripes are found (texture alone, as in photographs).",
+            low=3,
+            high=63,
+            step=2,
+            unit="px",
+        )
+        subtract_noise: bool = knob(
+            True,
+            "Subtract the energy that the sensor's noise alone would give: it makes dark "
+            "surfaces look equally sharp in both images.",
+        )
+
+    presets = {"paper": {"window_periods": 2, "subtract_noise": False}}
+
+    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+        from stages.dfd.focus import SensorNoise, focus_map
+        from stages.dfd.stripes import whole_period_taps
+
+        calibration = inputs["calibration"]
+        warnings = []
+        if calibration is not None and calibration.laplacian != parameters.laplacian:
+            warnings.append(
+                f"laplacian is {parameters.laplacian}, the calibration was made with "
+                f"{calibration.laplacian}: depth will be off"
+            )
+        noise = None
+        if parameters.subtract_noise:
+            noise = calibration.noise if calibration is not None else SensorNoise()
+        side = window_side_px(inputs["stripes"], parameters)
+        height, width = inputs["near"].shape
+        x_taps = whole_period_taps(min(side, width))
+        y_taps = whole_period_taps(min(side, height))
+        return {
+            "focus_near": focus_map(inputs["near"], x_taps, y_taps, parameters.laplacian, noise),
+            "focus_far": focus_map(inputs["far"], x_taps, y_taps, parameters.laplacian, noise),
+            WARNINGS: warnings,
+        }
+
+    def log(self, recording: Any, logged: Logged) -> None:
+        from stages.show import log_map
+
+        near, far = logged.artifacts["focus_near"], logged.artifacts["focus_far"]
+        # One scale for both, or their comparison, which is the whole point, would be lost.
+        top = max(float(near.max()), float(far.max()), 1e-6)
+        ticks = ("0", f"{top / 2:.1f}", f"{top:.1f}")
+        log_map(recording, "focus_maps/near", near, 0, top, "magma", ticks)
+        log_map(recording, "focus_maps/far", far, 0, top, "magma", ticks)
+
+    def views(self, logged: Logged) -> list[Any]:
+        import rerun.blueprint as rrb
+
+        from stages.show import map_view
+
+        shape = logged.artifacts["focus_near"].shape
+        return [
+            rrb.Vertical(
+                map_view("focus_maps/near", "focus map, near", shape),
+                map_view("focus_maps/far", "focus map, far", shape),
+                name=self.name,
+            )
+        ]
+
+    def explain(self, x: int, y: int, artifacts: Any, p: Any) -> list[Finding]:
+        near = float(artifacts["focus_near"][y, x])
+        far = float(artifacts["focus_far"][y, x])
+        ratio = (near - far) / (near + far) if near + far > 0 else 0.0
+        sharper = "near" if ratio > 0 else "far"
+        return [
+            Finding(
+                f"focus near {near:.2f}, far {far:.2f}: ratio {ratio:+.3f}, sharper in {sharper}",
+                {"focus_near": near, "focus_far": far, "ratio": ratio},
+                "window_periods",
+            )
+        ]
+
+
+def window_side_px(stripes: Any, parameters: Any) -> float:
+    """Side of the focus window: whole periods of the stripes, or ``window_px`` without any."""
+    if stripes is None:
+        return float(parameters.window_px)
+    return float(stripes.extent_px()) * int(parameters.window_periods)

@@ -1,0 +1,190 @@
+"""Stage ``registration``: near and far on one pixel grid (section 3.2, step one)."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from stages.artifacts import (
+    CALIBRATION,
+    DRIFT,
+    FAR,
+    FAR_IMAGE,
+    FLAT_IMAGE,
+    GAIN_DRIFT,
+    INTENSITY,
+    NEAR,
+    NEAR_IMAGE,
+    SATURATED,
+    STRIPES,
+)
+from workbench.stage import (
+    WARNINGS,
+    Finding,
+    Inputs,
+    Logged,
+    Outputs,
+    Stage,
+    StageError,
+    StageParameters,
+    knob,
+)
+
+_DRIFT_WARNING_PX = 0.5
+_GAIN_WARNING = 0.01
+
+
+class Registration(Stage):
+    """Takes the far image onto the near image's grid, and makes an image without stripes.
+
+    The similarity comes from the calibration; without one it can be measured on the frame
+    itself.  What misalignment is left, and how the balance of light between the sensors has
+    drifted since the calibration, are measured on every frame and told.
+    """
+
+    name = "registration"
+    needs = (NEAR_IMAGE, FAR_IMAGE, FLAT_IMAGE, CALIBRATION)
+    gives = (NEAR, FAR, INTENSITY, SATURATED, STRIPES, DRIFT, GAIN_DRIFT)
+
+    class Parameters(StageParameters):
+        similarity: Literal["calibration", "pair", "none"] = knob(
+            "calibration",
+            "Where the far-to-near map comes from: the calibration (none is done without one), "
+            "this frame's own image pair, or nowhere.",
+        )
+        intensity: Literal["flat", "stripes"] = knob(
+            "flat",
+            "The image for edges, regions and display: the recorded flat image where there is "
+            "one, or near and far averaged over one stripe period.",
+        )
+        correct_gain: bool = knob(
+            True,
+            "Scale the far image so that both sensors catch as much light as when calibrated: "
+            "a drift of 1 % costs 0.3 mm.",
+        )
+        saturation_percent: float = knob(
+            99.5,
+            "Grey levels from here up are taken as saturated and carry no depth.",
+            low=50,
+            high=100,
+            step=0.5,
+            unit="% of full scale",
+        )
+
+    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+        import cv2
+        import numpy as np
+
+        from stages.dfd.images import full_scale, grey
+        from stages.dfd.similarity import Similarity, misalignment_rms_px, refine_similarity
+        from stages.dfd.similarity import warp_to_near as warp
+        from stages.dfd.stripes import average_over_period, measure_stripes
+
+        near_raw, far_raw = inputs["near_image"], inputs["far_image"]
+        if near_raw.shape != far_raw.shape:
+            raise StageError(
+                f"near is {_size(near_raw)} and far is {_size(far_raw)}; they must be alike"
+            )
+        near, far = grey(near_raw), grey(far_raw)
+        height, width = near.shape
+        calibration = inputs["calibration"]
+        warnings: list[str] = []
+
+        similarity = Similarity.identity(width, height)
+        if calibration is not None:
+            known = calibration.similarity
+            if (known.width, known.height) != (width, height):
+                raise StageError(
+                    f"the calibration is for {known.width}×{known.height} pixels, "
+                    f"the images are {width}×{height}"
+                )
+            if parameters.similarity == "calibration":
+                similarity = known
+        if parameters.similarity == "pair":
+            similarity = refine_similarity([(near, far)], similarity)
+        limit = parameters.saturation_percent / 100 * full_scale(near_raw, far_raw)
+        saturated = (near >= limit) | ~np.isfinite(near)
+        far_saturated = (far >= limit) | ~np.isfinite(far)
+        if far_saturated.any():
+            moved = warp(far_saturated.astype(np.float32), similarity)
+            saturated |= moved > 0.1
+        near = np.nan_to_num(near, copy=False)
+        far = warp(np.nan_to_num(far, copy=False), similarity)
+
+        gain_drift = 1.0
+        if calibration is not None:
+            gain_drift = _light_ratio(near, far) / calibration.gain_near_over_far
+            if abs(gain_drift - 1) > _GAIN_WARNING:
+                done = "corrected" if parameters.correct_gain else "not corrected"
+                warnings.append(
+                    f"near over far light has drifted by {100 * (gain_drift - 1):+.1f} % since "
+                    f"the calibration ({done})"
+                )
+            if parameters.correct_gain:
+                far = far * np.float32(gain_drift)
+        stripes = calibration.stripes if calibration is not None else measure_stripes(near)
+        drift_px = misalignment_rms_px(near, far)
+        if drift_px > _DRIFT_WARNING_PX:
+            warnings.append(f"near and far are {drift_px:.1f} px apart after registration")
+        flat = inputs["flat_image"]
+        if flat is not None and parameters.intensity == "flat":
+            intensity = grey(flat)
+            if intensity.shape != near.shape:
+                raise StageError(f"flat is {_size(flat)}, near is {_size(near_raw)}")
+        else:
+            intensity = average_over_period(cv2.addWeighted(near, 0.5, far, 0.5, 0), stripes)
+        return {
+            "near": near,
+            "far": far,
+            "intensity": intensity,
+            "saturated": saturated,
+            "stripes": stripes,
+            "registration_drift_px": drift_px,
+            "gain_drift": gain_drift,
+            WARNINGS: warnings,
+        }
+
+    def log(self, recording: Any, logged: Logged) -> None:
+        import rerun as rr
+
+        from stages.show import grey_image, overlap
+
+        artifacts = logged.artifacts
+        recording.log("registration/overlap", overlap(artifacts["near"], artifacts["far"]))
+        recording.log("registration/intensity", grey_image(artifacts["intensity"]))
+        recording.log("registration/drift_px", rr.Scalars(artifacts["registration_drift_px"]))
+
+    def views(self, logged: Logged) -> list[Any]:
+        import rerun.blueprint as rrb
+
+        return [
+            rrb.Vertical(
+                rrb.Spatial2DView(
+                    origin="registration/overlap", name="near (red) over registered far (cyan)"
+                ),
+                rrb.Spatial2DView(origin="registration/intensity", name="intensity, no stripes"),
+                name=self.name,
+            )
+        ]
+
+    def explain(self, x: int, y: int, artifacts: Any, p: Any) -> list[Finding]:
+        near, far = float(artifacts["near"][y, x]), float(artifacts["far"][y, x])
+        saturated = bool(artifacts["saturated"][y, x])
+        state = "saturated" if saturated else "not saturated"
+        return [
+            Finding(
+                f"near {near:.1f}, far {far:.1f}: {state} (limit {p.saturation_percent:g} %)",
+                {"near": near, "far": far, "saturated": saturated},
+                "saturation_percent",
+            )
+        ]
+
+
+def _light_ratio(near: Any, far: Any) -> float:
+    """All light on the near sensor over all on the far one: blur moves light, it loses none."""
+    far_light = float(far.sum(dtype="float64"))
+    near_light = float(near.sum(dtype="float64"))
+    return near_light / far_light if near_light > 0 and far_light > 0 else 1.0
+
+
+def _size(image: Any) -> str:
+    return f"{image.shape[1]}×{image.shape[0]}"

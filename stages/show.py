@@ -1,0 +1,148 @@
+"""Pictures of this product's results in Rerun: one look for all stages.
+
+Only logging code uses this module.  A float image is logged as a ``DepthImage``, the archetype
+that has a colour map and a fixed range and shows the value under the cursor; what is unknown is
+painted over it in grey, for Rerun would give it the colour of the smallest value.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+UNKNOWN_COLOUR = (62, 62, 70)
+_BAR_STEPS = 64
+_BAR_ROOM = 1.3
+_TURBO, _MAGMA, _VIRIDIS = "turbo", "magma", "viridis"
+_OPENCV_MAPS = {
+    _TURBO: cv2.COLORMAP_TURBO,
+    _MAGMA: cv2.COLORMAP_MAGMA,
+    _VIRIDIS: cv2.COLORMAP_VIRIDIS,
+}
+
+
+def grey_image(image: np.ndarray, top: float | None = None) -> Any:
+    """An intensity image [H W], shown from black at 0 to white at ``top`` (its greatest)."""
+    highest = float(image.max()) if top is None else top
+    scale = 255 / highest if highest > 0 else 1.0
+    return rr.Image(cv2.convertScaleAbs(image, alpha=scale))
+
+
+def overlap(red: np.ndarray, cyan: np.ndarray) -> Any:
+    """Two images [H W] in one: what they share is grey, what only one has is coloured."""
+    top = max(float(red.max()), float(cyan.max()), 1e-6)
+    first = cv2.convertScaleAbs(red, alpha=255 / top)
+    second = cv2.convertScaleAbs(cyan, alpha=255 / top)
+    return rr.Image(cv2.merge([first, second, second]))
+
+
+def log_map(
+    recording: Any,
+    path: str,
+    image: np.ndarray,
+    low: float,
+    high: float,
+    colours: str,
+    ticks: tuple[str, str, str],
+) -> None:
+    """Log a float map [H W] under ``path``, with its unknown pixels and a colour bar.
+
+    ``ticks`` are the texts at the low end, the middle and the high end of the bar.
+    """
+    known = np.isfinite(image)
+    recording.log(
+        f"{path}/values",
+        rr.DepthImage(
+            np.where(known, image, np.float32(low)).astype(np.float32, copy=False),
+            meter=1.0,
+            depth_range=(low, high),
+            colormap=colours,
+        ),
+    )
+    recording.log(f"{path}/unknown", rr.SegmentationImage((~known).astype(np.uint8)))
+    recording.log(
+        f"{path}/unknown",
+        rr.AnnotationContext([(0, "known", (0, 0, 0, 0)), (1, "unknown", UNKNOWN_COLOUR)]),
+        static=True,
+    )
+    _log_bar(recording, path, image.shape, colours, ticks)
+
+
+def log_signed_error(recording: Any, path: str, error_mm: np.ndarray, span_mm: float) -> None:
+    """Log a signed error [H W]: blue where measured too near, red where too far, white at 0."""
+    known = np.isfinite(error_mm)
+    place = np.clip(np.nan_to_num(error_mm) / span_mm, -1, 1)
+    away = np.abs(place)[..., None]
+    end = np.where(place[..., None] < 0, _BLUE, _RED)
+    rgb = (_WHITE * (1 - away) + end * away).astype(np.uint8)
+    rgb[~known] = UNKNOWN_COLOUR
+    recording.log(f"{path}/values", rr.Image(rgb))
+    colours = np.array(
+        [
+            _WHITE * (1 - abs(p)) + (_BLUE if p < 0 else _RED) * abs(p)
+            for p in np.linspace(1, -1, _BAR_STEPS)
+        ],
+        np.uint8,
+    )
+    ticks = (f"{-span_mm:g} mm", "0", f"+{span_mm:g} mm")
+    _log_bar_strips(recording, path, error_mm.shape, colours, ticks)
+
+
+_WHITE = np.array([245.0, 245.0, 245.0])
+_BLUE = np.array([40.0, 90.0, 230.0])
+_RED = np.array([220.0, 40.0, 40.0])
+
+
+def _log_bar(
+    recording: Any, path: str, shape: tuple[int, ...], colours: str, ticks: tuple[str, str, str]
+) -> None:
+    levels = np.linspace(255, 0, _BAR_STEPS).astype(np.uint8)[:, None]
+    table = cv2.applyColorMap(levels, _OPENCV_MAPS[colours])[:, 0, ::-1]
+    _log_bar_strips(recording, path, shape, table, ticks)
+
+
+def _log_bar_strips(
+    recording: Any,
+    path: str,
+    shape: tuple[int, ...],
+    colours: np.ndarray,
+    ticks: tuple[str, str, str],
+) -> None:
+    height, width = shape[:2]
+    left = width * 1.05
+    rows = np.linspace(0, height - 1, _BAR_STEPS + 1)
+    recording.log(
+        f"{path}/bar",
+        rr.LineStrips2D(
+            [[(left, a), (left, b)] for a, b in zip(rows, rows[1:], strict=False)],
+            colors=colours,
+            radii=width * 0.02,
+        ),
+    )
+    low, middle, high = ticks
+    recording.log(
+        f"{path}/bar/ticks",
+        rr.Points2D(
+            [(left + width * 0.13, y) for y in (0.02 * height, 0.47 * height, 0.91 * height)],
+            labels=[high, middle, low],
+            colors=[_WHITE.astype(np.uint8)] * 3,
+            radii=0.05,
+            show_labels=True,
+        ),
+    )
+
+
+def map_view(path: str, name: str, shape: tuple[int, ...]) -> Any:
+    """A view of what :func:`log_map` logged, with room for the colour bar."""
+    height, width = shape[:2]
+    return rrb.Spatial2DView(
+        origin=path,
+        name=name,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(0, width * _BAR_ROOM), y_range=(-0.02 * height, 1.02 * height)
+        ),
+    )

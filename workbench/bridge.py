@@ -1,0 +1,256 @@
+"""A run in Rerun: the bench's own part of the picture, and the layout that holds all parts.
+
+Stages log and lay out their own results.  The bench adds the recorded images, times, scores,
+defects, parameters with provenance, and the pipeline as a graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from workbench.pipeline import Pipeline, Run, dependencies
+from workbench.report import RunReport
+from workbench.session import Session
+from workbench.stage import Logged, RecordedCamera, RecordedImage, Resource
+
+FRAME_TIMELINE = "frame"
+STAMP_TIMELINE = "stamp"
+
+_OK = (86, 160, 110)
+_BROKEN = (214, 70, 60)
+_SOURCE = (90, 130, 200)
+
+
+class Bridge:
+    """Logs the runs of one session to a recording stream."""
+
+    def __init__(self, session: Session, recording: rr.RecordingStream) -> None:
+        self.session = session
+        self.recording = recording
+        self._defects_told = -1
+        self._laid_out = False
+
+    def log(self, run: Run, report: RunReport, scores: Mapping[str, float]) -> None:
+        """One run: inputs, every stage's pictures, and the bench's own numbers."""
+        recording, frame = self.recording, run.frame
+        recording.set_time(FRAME_TIMELINE, sequence=frame.index)
+        recording.set_time(STAMP_TIMELINE, timestamp=np.datetime64(frame.stamp_ns, "ns"))
+        for channel, image in frame.images.items():
+            recording.log(f"recorded/{channel}", rr.Image(image))
+        broken = {failure.stage: failure.says for failure in run.failures}
+        for stage in self.session.pipeline.stages:
+            if stage.name in broken:
+                continue
+            try:
+                stage.log(recording, self._logged(run, stage.name))
+            except Exception as error:
+                broken[stage.name] = f"its pictures: {type(error).__name__}: {error}"
+        for name, milliseconds in run.stage_ms.items():
+            recording.log(f"bench/times/{name}", rr.Scalars(milliseconds))
+        for name, value in scores.items():
+            recording.log(f"bench/scores/{name}", rr.Scalars(value))
+        self._log_defects(report, broken)
+        self._log_graph(broken)
+        if not self._laid_out:
+            self._log_once(scores)
+            recording.send_blueprint(self.blueprint(run, bool(scores)))
+            self._laid_out = True
+
+    def close(self, report: RunReport) -> None:
+        """What is known only at the end: the recording's defects in full, and how it pairs."""
+        self._defects_told = -1
+        self._log_defects(report, {}, ended=True)
+
+    def _logged(self, run: Run, stage: str) -> Logged:
+        parameters = self.session.pipeline.settings.parameters[stage]
+        return Logged(run.artifacts, parameters, run.frame.truth)
+
+    # -- the bench's own entities -----------------------------------------------------------------
+
+    def _log_once(self, scores: Mapping[str, float]) -> None:
+        for stage in self.session.pipeline.stages:
+            self.recording.log(
+                f"bench/times/{stage.name}",
+                rr.SeriesLines(names=f"{stage.name} ms"),
+                static=True,
+            )
+        for name in scores:
+            self.recording.log(
+                f"bench/scores/{name}", rr.SeriesLines(names=name.split("/")[-1]), static=True
+            )
+        self.recording.log(
+            "bench/parameters",
+            rr.TextDocument(_parameters_page(self.session), media_type="text/markdown"),
+            static=True,
+        )
+        provenance = self.session.provenance()
+        self.recording.send_property(
+            "provenance",
+            rr.AnyValues(
+                bench=provenance["bench"],
+                recording=provenance["recording"]["digest"],
+                preset=provenance["preset"],
+                parameters=_flat_lines(provenance["parameters"]),
+                changed=[f"{k}={v}" for k, v in provenance["changed"].items()] or ["nothing"],
+                code=[f"{k}={v}" for k, v in provenance["code"].items()],
+                resources=[f"{k}={v['digest']}" for k, v in provenance["resources"].items()]
+                or ["none"],
+            ),
+        )
+
+    def _log_defects(
+        self, report: RunReport, broken: Mapping[str, str], ended: bool = False
+    ) -> None:
+        defects = self.session.recording.defects
+        told = len(defects) + sum(report.failures.values()) + len(report.warnings) + len(broken)
+        if told == self._defects_told:
+            return
+        self._defects_told = told
+        lines = ["## Defects of the recording", *_bullets(defects.lines())]
+        if ended and defects.pairing is not None:
+            lines += ["", defects.pairing.line()]
+        failures = [
+            f"**{stage}**: {says} ({count} frames)"
+            for (stage, says), count in report.failures.items()
+        ]
+        failures += [
+            f"**{stage}**: {says}"
+            for stage, says in broken.items()
+            if not any(stage == failed for failed, _ in report.failures)
+        ]
+        if failures:
+            lines += ["## Stages that failed", *_bullets(failures)]
+        warnings = [f"{says} ({count} frames)" for says, count in report.warnings.items()]
+        if warnings:
+            lines += ["## Warnings", *_bullets(warnings)]
+        self.recording.log(
+            "bench/defects", rr.TextDocument("\n".join(lines), media_type="text/markdown")
+        )
+
+    def _log_graph(self, broken: Mapping[str, str]) -> None:
+        pipeline = self.session.pipeline
+        edges = sorted({(giver, taker) for giver, taker, _ in dependencies(pipeline.stages)})
+        available = self._available()
+        names = {s.name for s in pipeline.stages}
+        edges = [(a, b) for a, b in edges if a in names or a in available]
+        sources = sorted({giver for giver, _ in edges} - names)
+        nodes = [*sources, *(s.name for s in pipeline.stages)]
+        colours = [
+            _SOURCE if node in sources else _BROKEN if node in broken else _OK for node in nodes
+        ]
+        self.recording.log(
+            "bench/pipeline",
+            rr.GraphNodes(nodes, labels=nodes, colors=colours, positions=_placed(nodes, edges)),
+            rr.GraphEdges(edges, graph_type="directed"),
+        )
+
+    def _available(self) -> set[str]:
+        pipeline = self.session.pipeline
+        images = pipeline.sources(RecordedImage)
+        there = self.session.recording.channel_topics
+        cameras = pipeline.sources(RecordedCamera)
+        resources = pipeline.sources(Resource)
+        return (
+            {i.name for i in images if i.channel in there}
+            | {c.name for c in cameras if c.channel in there}
+            | {r.name for r in resources if r.name in pipeline.resources}
+        )
+
+    # -- the layout -------------------------------------------------------------------------------
+
+    def blueprint(self, run: Run, scored: bool) -> rrb.Blueprint:
+        """One row that reads from left to right, stage after stage, and a shelf below it."""
+        columns: list[Any] = [
+            rrb.Vertical(
+                *(
+                    rrb.Spatial2DView(origin=f"recorded/{channel}", name=f"recorded {channel}")
+                    for channel in run.frame.images
+                ),
+                name="recording",
+            )
+        ]
+        shares = [1.0]
+        for stage in self.session.pipeline.stages:
+            for view in stage.views(self._logged(run, stage.name)):
+                columns.append(view)
+                shares.append(1.7 if isinstance(view, rrb.Spatial3DView) else 1.0)
+        shelf: list[Any] = []
+        if scored:
+            shelf.append(rrb.TimeSeriesView(origin="bench/scores", name="against ground truth"))
+        shelf += [
+            rrb.TimeSeriesView(origin="bench/times", name="stage times, ms"),
+            rrb.TextDocumentView(origin="bench/defects", name="defects"),
+            rrb.TextDocumentView(origin="bench/parameters", name="parameters and provenance"),
+            rrb.GraphView(origin="bench/pipeline", name="pipeline"),
+        ]
+        return rrb.Blueprint(
+            rrb.Vertical(
+                rrb.Horizontal(*columns, column_shares=shares),
+                rrb.Horizontal(*shelf),
+                row_shares=[2.6, 1],
+            ),
+            rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
+            rrb.SelectionPanel(state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+        )
+
+
+def _placed(nodes: list[str], edges: list[tuple[str, str]]) -> list[tuple[float, float]]:
+    """Each node as far to the right as its longest way from a source, stacked within a column."""
+    rank = dict.fromkeys(nodes, 0)
+    for _ in nodes:
+        for giver, taker in edges:
+            rank[taker] = max(rank[taker], rank[giver] + 1)
+    taken: dict[int, int] = {}
+    size = {column: list(rank.values()).count(column) for column in rank.values()}
+    places = []
+    for node in nodes:
+        row = taken.get(rank[node], 0)
+        taken[rank[node]] = row + 1
+        places.append((rank[node] * 130.0, (row - (size[rank[node]] - 1) / 2) * 45.0))
+    return places
+
+
+def _bullets(lines: Iterable[str]) -> list[str]:
+    return [f"- {line}" for line in lines] or ["- none"]
+
+
+def _flat_lines(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return [
+        f"{stage}.{name}={value}"
+        for stage, values in parameters.items()
+        for name, value in values.items()
+    ] or ["none"]
+
+
+def _parameters_page(session: Session) -> str:
+    """Parameters (changed ones in bold) and provenance, as markdown."""
+    pipeline: Pipeline = session.pipeline
+    settings = pipeline.settings
+    provenance = session.provenance()
+    lines = [
+        f"**{provenance['recording']['name']}**, preset **{settings.preset}**",
+        "",
+        "| parameter | value | unit |",
+        "|---|---|---|",
+    ]
+    for stage in pipeline.stages:
+        for name, knob in stage.Parameters.knobs().items():
+            value = getattr(settings.parameters[stage.name], name)
+            address = f"{stage.name}.{name}"
+            shown = f"**{value}** (changed)" if address in settings.changed else f"{value}"
+            lines.append(f"| {address} | {shown} | {knob.unit} |")
+    lines += ["", "| provenance | |", "|---|---|", f"| bench | {provenance['bench']} |"]
+    lines.append(f"| recording | {provenance['recording']['digest']} |")
+    for name, resource in provenance["resources"].items():
+        lines.append(f"| {name} | {resource['name']} {resource['digest']} |")
+    for name, digest in provenance["code"].items():
+        lines.append(f"| code of {name} | {digest} |")
+    for name, number in provenance["libraries"].items():
+        lines.append(f"| {name} | {number} |")
+    return "\n".join(lines)

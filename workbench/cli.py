@@ -1,0 +1,272 @@
+"""The command line.  Declares flags; the work is in ``workbench.commands``, imported late.
+
+Exit codes: 0 done, 1 the data or the run failed, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from workbench.errors import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_TERMINATED,
+    EXIT_USAGE,
+    DataError,
+    Terminated,
+    UsageError,
+)
+
+app = typer.Typer(
+    name="workbench",
+    help="An interactive debugging bench for vision pipelines: replay a recording through its "
+    "stages, see every intermediate result, measure it against ground truth.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+Rec = Annotated[Path, typer.Argument(help="The recording, an MCAP file.", metavar="REC")]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(help="Calibration file; the one beside the recording if not given."),
+]
+Models = Annotated[
+    Path | None,
+    typer.Option(help="Model database; the one beside the recording if not given."),
+]
+Preset = Annotated[str | None, typer.Option(help="Named set of parameters.")]
+Config = Annotated[
+    Path | None,
+    typer.Option(help="TOML with parameters, laid over the preset."),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", help="One parameter, over preset and file.", metavar="STAGE.PARAMETER=VALUE"
+    ),
+]
+Topic = Annotated[
+    list[str] | None,
+    typer.Option(help="Where a channel's images are.", metavar="CHANNEL=/TOPIC"),
+]
+Frames = Annotated[
+    str | None,
+    typer.Option(help="Only these frames, as A:B (B not included), A: or :B.", metavar="A:B"),
+]
+Until = Annotated[
+    str | None,
+    typer.Option(help="Stop after this stage.", metavar="STAGE"),
+]
+Plugin = Annotated[
+    list[Path] | None,
+    typer.Option(help="A Python file with stages of your own.", metavar="FILE"),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+
+
+def _options(
+    recording: Path,
+    calibration: Path | None,
+    models: Path | None,
+    preset: str | None,
+    config: Path | None,
+    assignments: list[str] | None,
+    topic: list[str] | None,
+    frames: str | None,
+    until: str | None,
+    plugin: list[Path] | None,
+) -> Any:
+    from workbench.session import Options
+
+    resources = {"calibration": calibration, "models": models}
+    return Options(
+        recording,
+        {name: path for name, path in resources.items() if path is not None},
+        preset,
+        config,
+        assignments or [],
+        parse_topics(topic or []),
+        parse_frames(frames),
+        until,
+        plugin or [],
+    )
+
+
+def parse_frames(text: str | None) -> tuple[int, int | None]:
+    """``A:B`` as (A, B); an end that is not given is 0 or None.  Raises :class:`UsageError`."""
+    if text is None:
+        return 0, None
+    first, colon, last = text.partition(":")
+    try:
+        start = int(first) if first else 0
+        stop = (int(last) if last else None) if colon else start + 1
+    except ValueError:
+        start, stop = -1, None
+    if start < 0 or (stop is not None and stop <= start):
+        raise UsageError(f"--frames {text}: expected A:B with 0 <= A < B")
+    return start, stop
+
+
+def parse_topics(texts: list[str]) -> dict[str, str]:
+    """``CHANNEL=/TOPIC`` texts as a mapping.  Raises :class:`UsageError`."""
+    topics = {}
+    for text in texts:
+        channel, equals, topic = text.partition("=")
+        if not (channel and equals and topic):
+            raise UsageError(f"--topic {text}: expected CHANNEL=/TOPIC")
+        topics[channel] = topic
+    return topics
+
+
+@app.command()
+def replay(
+    recording: Rec,
+    save: Annotated[Path | None, typer.Option(help="Keep what is shown in this .rrd file.")] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of the viewer; needs no screen.")
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Show it in a browser.")] = False,
+    report: Annotated[
+        Path | None,
+        typer.Option("--json", help="Write the report to this file (-: standard output)."),
+    ] = None,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1920x1080",
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+) -> None:
+    """Run a recording through the stages and show every result in Rerun."""
+    from workbench.commands import replay as command
+
+    options = _options(
+        recording, calibration, models, preset, config, assignments, topic, frames, until, plugin
+    )
+    command.run(options, save, screenshot, web, report, window)
+
+
+@app.command()
+def info(recording: Rec, topic: Topic = None, as_json: Json = False) -> None:
+    """What is in a recording: topics, schemas, frames, pairs, rates, and every defect found."""
+    from workbench.commands import info as command
+
+    command.run(recording, parse_topics(topic or []), as_json)
+
+
+@app.command()
+def stages(
+    name: Annotated[str | None, typer.Argument(help="Only this stage.")] = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """The stages and their parameters, with ranges, units and reasons."""
+    from workbench.commands import stages as command
+
+    command.run(name, plugin or [], as_json)
+
+
+@app.command()
+def export(
+    recording: Rec,
+    to: Annotated[Path, typer.Option(help="Folder to write to.", metavar="DIR")],
+    artifacts: Annotated[
+        str | None, typer.Option(help="Only these artifacts.", metavar="A,B")
+    ] = None,
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Write artifacts as frame_000000.npz and one line a frame in results.jsonl."""
+    from workbench.commands import export as command
+
+    options = _options(
+        recording, calibration, models, preset, config, assignments, topic, frames, until, plugin
+    )
+    command.run(options, to, artifacts, as_json)
+
+
+@app.command()
+def evaluate(
+    recording: Rec,
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Measure the stages against the ground truth in the recording."""
+    from workbench.commands import evaluate as command
+
+    options = _options(
+        recording, calibration, models, preset, config, assignments, topic, frames, until, plugin
+    )
+    command.run(options, as_json)
+
+
+@app.command()
+def calibrate(
+    recording: Rec,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],
+    assignments: Set = None,
+    topic: Topic = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Calibrate from a recording of known planes (and dot grids), with a report."""
+    from workbench.commands import calibrate as command
+
+    command.run(
+        recording, output, assignments or [], parse_topics(topic or []), plugin or [], as_json
+    )
+
+
+def _terminate(signum: int, frame: Any) -> None:
+    raise Terminated
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line, never a traceback."""
+    import click
+
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code = app(standalone_mode=False) or 0
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except click.Abort as error:
+        terminated = isinstance(error.__cause__, Terminated)
+        code = EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+    except UsageError as error:
+        print(f"workbench: {error}", file=sys.stderr)
+        code = EXIT_USAGE
+    except (DataError, OSError) as error:
+        print(f"workbench: {error}", file=sys.stderr)
+        code = EXIT_FAILED
+    sys.exit(code)

@@ -1,0 +1,82 @@
+"""``workbench export``: artifacts as files that any tool reads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from workbench.console import closing_tables, out, tracked
+from workbench.errors import EXIT_FAILED, DataError, UsageError
+from workbench.files import replacing
+from workbench.pipeline import Run
+from workbench.report import RunReport, to_json, write_beside
+from workbench.session import Options, Session
+
+
+def run(options: Options, folder: Path, artifacts: str | None, as_json: bool) -> None:
+    """Export; exits with 1 if a stage failed on any frame or there was no frame."""
+    session = Session.open(options)
+    wanted = _wanted(session, artifacts)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"--to {folder}: {error.strerror}") from error
+    report = RunReport(session)
+    with (
+        replacing(folder / "results.jsonl", keep_partial=True) as beside,
+        beside.open("w", encoding="utf-8") as lines,
+    ):
+        for result in tracked(session.runs(), "export", session.count()):
+            report.add(result)
+            _write_arrays(folder / f"frame_{result.frame.index:06d}.npz", result, wanted)
+            lines.write(json.dumps(result_line(result), sort_keys=True) + "\n")
+    write_beside(folder / "provenance.json", to_json(session.provenance()) + "\n")
+    if as_json:
+        print(to_json(report.as_dict() | {"to": str(folder), "artifacts": wanted}))
+    else:
+        closing_tables(report)
+        out.print(f"wrote {report.frames} frames to {folder}", soft_wrap=True, markup=False)
+    if report.frames == 0:
+        raise DataError(f"{options.recording}: no frame to export")
+    raise typer.Exit(EXIT_FAILED if report.failed else 0)
+
+
+def result_line(run: Run) -> dict[str, Any]:
+    """One line of ``results.jsonl``."""
+    failures = [f"{failure.stage} failed: {failure.says}" for failure in run.failures]
+    return {
+        "index": run.frame.index,
+        "stamp_ns": run.frame.stamp_ns,
+        "verdict": run.artifacts.get("verdict"),
+        "poses": run.artifacts.get("poses", []),
+        "stage_ms": {name: round(ms, 3) for name, ms in run.stage_ms.items()},
+        "warnings": [*run.warnings, *failures],
+    }
+
+
+def _wanted(session: Session, artifacts: str | None) -> list[str]:
+    known = session.pipeline.artifacts
+    if artifacts is None:
+        return list(known)
+    names = [name.strip() for name in artifacts.split(",") if name.strip()]
+    for name in names:
+        if name not in known:
+            raise UsageError(f"--artifacts {name}: no such artifact; there are: {', '.join(known)}")
+    if not names:
+        raise UsageError("--artifacts: expected names separated by commas")
+    return names
+
+
+def _write_arrays(path: Path, run: Run, wanted: list[str]) -> None:
+    """The arrays and numbers among the wanted artifacts; the others have no place in an npz."""
+    arrays = {
+        name: np.asarray(run.artifacts[name])
+        for name in wanted
+        if isinstance(run.artifacts.get(name), np.ndarray | int | float)
+    }
+    with replacing(path) as beside, beside.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)

@@ -1,0 +1,108 @@
+"""What the commands say on a terminal: tables, progress, one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from workbench.report import RunReport
+from workbench.stage import Score
+
+T = TypeVar("T")
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text(f"{speed:.1f} frames/s" if speed else "… frames/s")
+
+
+@contextmanager
+def progress(description: str, total: int | None) -> Iterator[Any]:
+    """A progress bar on stderr, only on a terminal; yields ``advance()``."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        TimeRemainingColumn(),
+        console=err,
+        disable=not err.is_terminal,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task(description, total=total)
+        yield lambda: bar.advance(task)
+
+
+def tracked(items: Iterable[T], description: str, total: int | None) -> Iterator[T]:
+    """``items`` with a progress bar."""
+    with progress(description, total) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
+def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Print a table; numbers are right-aligned by their header ending in a unit or ``#``."""
+    grid = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
+    for column in columns:
+        numeric = column.endswith((" ms", "#", "value", "covered"))
+        grid.add_column(column, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        grid.add_row(*(str(cell) for cell in row))
+    out.print(grid)
+
+
+def score_rows(stage: str, scores: Iterable[Score]) -> Iterator[tuple[str, ...]]:
+    """Scores as table rows: stage, figure, value, unit, covered, note."""
+    for score in scores:
+        covered = "" if score.coverage is None else f"{100 * score.coverage:.1f} %"
+        yield (stage, score.name, f"{score.value:.3f}", score.unit, covered, score.note)
+
+
+SCORE_COLUMNS = ("stage", "figure", "value", "unit", "covered", "note")
+
+
+def closing_tables(report: RunReport) -> None:
+    """The end of a run: frames, defects, times, accuracy, failures, warnings."""
+    defects = report.session.recording.defects
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(defects.counts.items()))
+    state = " (interrupted)" if report.interrupted else ""
+    out.print(f"[bold]{report.frames} frames[/bold]{state}; defects: {counts or 'none'}")
+    for line in defects.lines():
+        out.print(f"  {line}", style="yellow", markup=False)
+    if report.times_ms:
+        table(
+            "Stages",
+            ("stage", "median ms", "worst ms"),
+            (
+                (name, f"{report.median_ms(name):.2f}", f"{report.worst_ms[name]:.2f}")
+                for name in report.times_ms
+            ),
+        )
+    scores = report.scores()
+    if scores:
+        rows = [row for stage, own in scores.items() for row in score_rows(stage, own)]
+        table("Against ground truth", SCORE_COLUMNS, rows)
+    for says, count in report.warnings.items():
+        out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)
+    for (stage, says), count in report.failures.items():
+        out.print(f"FAILED, {count} frames: {stage}: {says}", style="bold red", markup=False)

@@ -1,0 +1,21 @@
+"""Mistakes that are told in one line, and the exit codes that go with them."""
+
+from __future__ import annotations
+
+EXIT_DONE = 0
+EXIT_FAILED = 1
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+
+class DataError(Exception):
+    """The data, or the run on it, failed: exit code 1."""
+
+
+class UsageError(Exception):
+    """The command was called wrongly: exit code 2."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came: everything is closed as for Ctrl-C, so that what is written stays readable."""

@@ -1,0 +1,315 @@
+"""Ordering stages by needs and gives, running them, and keeping what is still valid."""
+
+from __future__ import annotations
+
+import time
+import warnings as python_warnings
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from workbench.digest import digest_of, digest_of_code, digest_of_file
+from workbench.settings import Settings
+from workbench.stage import (
+    WARNINGS,
+    Artifact,
+    RecordedCamera,
+    RecordedImage,
+    Resource,
+    Stage,
+    StageError,
+)
+
+if TYPE_CHECKING:
+    from workbench.recording import Frame
+
+S = TypeVar("S", bound=Artifact)
+
+DEFAULT_STORE_BYTES = 256 << 20
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A stage that did not give its results on one frame."""
+
+    stage: str
+    says: str
+    blocked_by: str | None = None
+    """The stage whose failure left this one without its inputs; None if it failed itself."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One frame through the stages."""
+
+    frame: Frame
+    artifacts: Mapping[str, Any]
+    digests: Mapping[str, str]
+    failures: tuple[Failure, ...]
+    warnings: tuple[str, ...]
+    stage_ms: Mapping[str, float]
+    """Milliseconds that each stage's result took to compute (also where it was kept)."""
+    computed: frozenset[str]
+    """The stages that really ran; the others' results were kept from before."""
+
+
+@dataclass(frozen=True)
+class _Result:
+    outputs: Mapping[str, Any]
+    warnings: tuple[str, ...]
+    milliseconds: float
+    size: int
+
+
+@dataclass
+class ResultStore:
+    """Stage results under their digests, oldest dropped first beyond ``capacity_bytes``."""
+
+    capacity_bytes: int = DEFAULT_STORE_BYTES
+    _results: OrderedDict[str, _Result] = field(default_factory=OrderedDict)
+    _bytes: int = 0
+
+    def get(self, digest: str) -> _Result | None:
+        result = self._results.get(digest)
+        if result is not None:
+            self._results.move_to_end(digest)
+        return result
+
+    def put(self, digest: str, result: _Result) -> None:
+        self._results[digest] = result
+        self._bytes += result.size
+        while self._bytes > self.capacity_bytes and len(self._results) > 1:
+            _, dropped = self._results.popitem(last=False)
+            self._bytes -= dropped.size
+
+
+class Pipeline:
+    """Stages in an order in which each finds what it needs.
+
+    ``until`` keeps only that stage and what it needs.  ``resources`` maps the names of
+    :class:`Resource` artifacts to files.  Raises :class:`StageError` if the stages do not fit
+    together, or a resource cannot be read.
+    """
+
+    def __init__(
+        self,
+        stages: Mapping[str, Stage],
+        settings: Settings,
+        resources: Mapping[str, Path] | None = None,
+        until: str | None = None,
+        store: ResultStore | None = None,
+    ) -> None:
+        self.stages = ordered(stages, until)
+        self.settings = settings
+        self.store = store or ResultStore()
+        self.resources: dict[str, tuple[Any, str]] = {}
+        self.resource_paths = dict(resources or {})
+        for need in self.sources(Resource):
+            path = self.resource_paths.get(need.name)
+            if path is not None and need.load is not None:
+                self.resources[need.name] = _load(need, path)
+        self._code = {s.name: digest_of_code(type(s).__module__) for s in self.stages}
+        self._warm: set[str] = set()
+
+    def sources(self, kind: type[S]) -> list[S]:
+        """The needs of one kind that no stage gives, without doubles; required where any is."""
+        found: dict[str, S] = {}
+        for stage in self.stages:
+            for need in stage.needs:
+                if isinstance(need, kind) and (need.name not in found or need.required):
+                    found[need.name] = need
+        return list(found.values())
+
+    @property
+    def channels(self) -> tuple[list[str], list[str]]:
+        """The recorded image channels that must be there, and those that may be."""
+        images = self.sources(RecordedImage)
+        return (
+            [i.channel for i in images if i.required],
+            [i.channel for i in images if not i.required],
+        )
+
+    @property
+    def artifacts(self) -> dict[str, Artifact]:
+        """Every artifact that the stages give, by name, in order."""
+        return {artifact.name: artifact for stage in self.stages for artifact in stage.gives}
+
+    def code_digests(self) -> dict[str, str]:
+        """The digest of each stage's code."""
+        return dict(self._code)
+
+    def run(self, frame: Frame) -> Run:
+        """The frame through all stages.  A stage's exception never hides the others' results."""
+        artifacts: dict[str, Any] = {}
+        digests: dict[str, str] = {}
+        self._take_sources(frame, artifacts, digests)
+        failures: list[Failure] = []
+        failed_givers: dict[str, str] = {}
+        warnings: list[str] = []
+        stage_ms: dict[str, float] = {}
+        computed: set[str] = set()
+        for stage in self.stages:
+            lacking = [n.name for n in stage.needs if n.required and artifacts.get(n.name) is None]
+            if lacking:
+                failures.append(_lacking(stage, lacking, failed_givers))
+                failed_givers.update(
+                    (a.name, failed_givers.get(lacking[0], stage.name)) for a in stage.gives
+                )
+                continue
+            parameters = self.settings.parameters[stage.name]
+            key = digest_of(
+                [stage.name, self._code[stage.name], parameters.model_dump_json()]
+                + [f"{n.name} {digests.get(n.name)}" for n in stage.needs]
+            )
+            result = self.store.get(key)
+            if result is None:
+                inputs = {n.name: artifacts.get(n.name) for n in stage.needs}
+                try:
+                    result = self._compute(stage, inputs, parameters)
+                except Exception as error:
+                    failures.append(Failure(stage.name, _one_line(error)))
+                    failed_givers.update((a.name, stage.name) for a in stage.gives)
+                    continue
+                self.store.put(key, result)
+                computed.add(stage.name)
+            artifacts.update(result.outputs)
+            digests.update((a.name, digest_of([key, a.name])) for a in stage.gives)
+            warnings += [f"{stage.name}: {says}" for says in result.warnings]
+            stage_ms[stage.name] = result.milliseconds
+        return Run(
+            frame,
+            MappingProxyType(artifacts),
+            MappingProxyType(digests),
+            tuple(failures),
+            tuple(warnings),
+            MappingProxyType(stage_ms),
+            frozenset(computed),
+        )
+
+    def _take_sources(
+        self, frame: Frame, artifacts: dict[str, Any], digests: dict[str, str]
+    ) -> None:
+        for image in self.sources(RecordedImage):
+            if image.channel in frame.images:
+                artifacts[image.name] = frame.images[image.channel]
+                digests[image.name] = f"{frame.digest} {image.channel}"
+        for camera in self.sources(RecordedCamera):
+            recorded = frame.cameras.get(camera.channel)
+            if recorded is not None:
+                artifacts[camera.name] = recorded
+                digests[camera.name] = digest_of(
+                    [recorded.width, recorded.height, recorded.K, recorded.D]
+                )
+        for name, (value, digest) in self.resources.items():
+            artifacts[name] = value
+            digests[name] = digest
+
+    def _compute(self, stage: Stage, inputs: Mapping[str, Any], parameters: Any) -> _Result:
+        if stage.name not in self._warm:
+            # The first call of a stage pays for imports and compilation, which would be told as
+            # its time on the first frame; the timed call is the second.
+            stage.compute(inputs, parameters)
+            self._warm.add(stage.name)
+        with python_warnings.catch_warnings(record=True) as caught:
+            python_warnings.simplefilter("always")
+            start = time.perf_counter()
+            outputs = dict(stage.compute(inputs, parameters))
+            milliseconds = (time.perf_counter() - start) * 1e3
+        says = [*outputs.pop(WARNINGS, ()), *(str(w.message) for w in caught)]
+        expected = {artifact.name for artifact in stage.gives}
+        if set(outputs) != expected:
+            raise StageError(f"gave {sorted(outputs)} where it declares {sorted(expected)}")
+        sizes: dict[str, int] = {}
+        size = 0
+        for artifact in stage.gives:
+            value = outputs[artifact.name]
+            artifact.check(value, sizes)
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+                size += value.nbytes
+        return _Result(MappingProxyType(outputs), tuple(says), milliseconds, size)
+
+
+def ordered(stages: Mapping[str, Stage], until: str | None = None) -> list[Stage]:
+    """The stages in an order in which each comes after those that give what it needs.
+
+    Stages that do not depend on one another keep the order of their names' arrival.  An optional
+    need orders as well, where some stage gives it.  Raises :class:`StageError` for two stages
+    that give one artifact, for a need that nothing gives, for a circle, and for an unknown
+    ``until``.
+    """
+    giver: dict[str, str] = {}
+    for stage in stages.values():
+        for artifact in stage.gives:
+            if artifact.name in giver:
+                raise StageError(
+                    f"both {giver[artifact.name]} and {stage.name} give {artifact.name}"
+                )
+            giver[artifact.name] = stage.name
+    needs: dict[str, list[str]] = {}
+    for stage in stages.values():
+        needs[stage.name] = []
+        for need in stage.needs:
+            if isinstance(need, RecordedImage | RecordedCamera | Resource):
+                continue
+            if need.name in giver:
+                needs[stage.name].append(giver[need.name])
+            elif need.required:
+                raise StageError(f"{stage.name} needs {need.name}, which no stage gives")
+    if until is not None and until not in stages:
+        raise StageError(f"no stage {until!r}; stages: {', '.join(stages)}")
+    order: list[Stage] = []
+    placed: set[str] = set()
+
+    def place(name: str, path: Sequence[str]) -> None:
+        if name in placed:
+            return
+        if name in path:
+            circle = " → ".join([*path[path.index(name) :], name])
+            raise StageError(f"stages need each other in a circle: {circle}")
+        for before in needs[name]:
+            place(before, [*path, name])
+        placed.add(name)
+        order.append(stages[name])
+
+    for name in [until] if until is not None else stages:
+        place(name, [])
+    return order
+
+
+def dependencies(stages: Iterable[Stage]) -> list[tuple[str, str, str]]:
+    """The pipeline as a graph: (giver, taker, artifact); a source's giver is its own name."""
+    stages = list(stages)
+    giver = {a.name: s.name for s in stages for a in s.gives}
+    return [
+        (giver.get(need.name, need.name), stage.name, need.name)
+        for stage in stages
+        for need in stage.needs
+    ]
+
+
+def _load(need: Resource, path: Path) -> tuple[Any, str]:
+    assert need.load is not None
+    try:
+        return need.load(path), digest_of_file(path)
+    except OSError as error:
+        raise StageError(f"--{need.name} {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise StageError(f"--{need.name} {path}: {error}") from error
+
+
+def _lacking(stage: Stage, lacking: Sequence[str], failed: Mapping[str, str]) -> Failure:
+    culprit = next((failed[name] for name in lacking if name in failed), None)
+    if culprit is not None:
+        return Failure(stage.name, f"not run: {culprit} failed", blocked_by=culprit)
+    return Failure(stage.name, f"not run: the recording has no {', '.join(lacking)}")
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, StageError) else f"{type(error).__name__}: {text}"

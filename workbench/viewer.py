@@ -1,0 +1,230 @@
+"""Where logged data goes: a native viewer, a browser, a file, a screenshot.
+
+Everything that starts, talks to or relies on a particular Rerun viewer is in this module; so are
+its unstable interfaces.  Viewers are started as children that listen on loopback alone, which
+the SDK's own ``spawn`` and ``serve`` functions cannot be told.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import rerun as rr
+
+from workbench.errors import DataError
+from workbench.files import replacing
+
+LOOPBACK = "127.0.0.1"
+APPLICATION_ID = "workbench"
+
+_START_SECONDS = 20.0
+_TOAST_SECONDS = 5.0
+_SETTLE_SECONDS = 20.0
+_POLL_SECONDS = 0.4
+
+
+@dataclass(frozen=True)
+class Destinations:
+    """Where a replay goes; any of them together."""
+
+    native: bool = False
+    web: bool = False
+    save: Path | None = None
+    screenshot: Path | None = None
+    window: tuple[int, int] = (1920, 1080)
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    if sys.platform.startswith("linux"):
+        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return True
+
+
+@dataclass
+class Stream:
+    """A recording stream into one or more destinations; made by :func:`opened`."""
+
+    recording: rr.RecordingStream
+    web_url: str | None = None
+    child: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+
+    def wait_for_viewer(self) -> None:
+        """Stay as long as the viewer does (a browser's server must not die with the replay)."""
+        if self.child is not None:
+            self.child.wait()
+
+
+@contextmanager
+def opened(destinations: Destinations, recording_id: str) -> Iterator[Stream]:
+    """Open the destinations, and close them whatever happens.
+
+    A saved file is written as ``NAME.part`` and renamed when it is complete, and also when the
+    run is interrupted or fails: what was logged until then is kept, with its footer.  A
+    screenshot is taken at the end of a run that did not fail.  Raises :class:`DataError` where
+    a viewer or a file cannot be opened.
+    """
+    recording = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
+    # Frames and recorded stamps are the timelines that mean something; and wall-clock times
+    # would make every run's file differ.
+    recording.set_log_time_enabled(False)
+    recording.set_log_tick_enabled(False)
+    sinks: list[Any] = []
+    stream = Stream(recording)
+    with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
+        file = _file_for(destinations, Path(folder))
+        if file is not None:
+            sinks.append(_file_sink(file))
+        if destinations.native or destinations.web:
+            port = free_port()
+            stream.child, stream.web_url = _start_viewer(destinations, port)
+            sinks.append(rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy"))
+        if sinks:
+            recording.set_sinks(*sinks)
+        try:
+            yield stream
+            complete = True
+        except BaseException:
+            complete = False
+            raise
+        finally:
+            # A viewer that was closed meanwhile makes flush raise; the file is whole anyway.
+            with suppress(RuntimeError):
+                recording.flush()
+            recording.disconnect()
+            if file is not None and destinations.save is not None:
+                file = file.replace(destinations.save)
+            if file is not None and destinations.screenshot is not None and complete:
+                take_screenshot(file, destinations.screenshot, destinations.window)
+            if stream.child is not None and destinations.web:
+                stream.child.terminate()
+
+
+def _file_for(destinations: Destinations, folder: Path) -> Path | None:
+    if destinations.save is not None:
+        return destinations.save.with_name(destinations.save.name + ".part")
+    if destinations.screenshot is not None:
+        return folder / "replay.rrd"
+    return None
+
+
+def _file_sink(path: Path) -> Any:
+    try:
+        path.open("wb").close()
+    except OSError as error:
+        raise DataError(f"{path.with_suffix('')}: cannot be written: {error.strerror}") from error
+    return rr.FileSink(str(path))
+
+
+def rerun_program() -> str:
+    """The Rerun program of this Python environment, wherever PATH points."""
+    import rerun_cli
+
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    packaged = Path(rerun_cli.__file__).parent / name
+    found = str(packaged) if packaged.is_file() else shutil.which("rerun")
+    if found is None:
+        raise DataError("the rerun program is not installed (pip install rerun-sdk)")
+    return found
+
+
+def free_port() -> int:
+    """A TCP port that is free on loopback at this moment."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _start_viewer(
+    destinations: Destinations, port: int
+) -> tuple[subprocess.Popen[bytes], str | None]:
+    arguments = [rerun_program(), "--bind", LOOPBACK, "--port", str(port)]
+    url = None
+    if destinations.web:
+        web_port = free_port()
+        arguments += ["--serve-web", "--web-viewer-port", str(web_port)]
+        url = f"http://{LOOPBACK}:{web_port}/?url=rerun%2Bhttp://{LOOPBACK}:{port}/proxy"
+    child = subprocess.Popen(
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    _await_port(port, child)
+    if url is not None and has_display():
+        webbrowser.open(url)
+    return child, url
+
+
+def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + _START_SECONDS
+    while time.monotonic() < deadline:
+        if child.poll() is not None:
+            raise DataError(f"the Rerun viewer ended at once (exit code {child.returncode})")
+        with suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=0.5):
+            return
+        time.sleep(0.05)
+    child.terminate()
+    raise DataError(f"the Rerun viewer did not start within {_START_SECONDS:g} s")
+
+
+def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
+    """A picture of a saved recording as the native viewer shows it, with no screen.
+
+    Waits until the viewer's start-up messages are gone and two pictures in a row are the same.
+    Needs a Vulkan driver (Debian: mesa-vulkan-drivers).  Raises :class:`DataError`.
+    """
+    from rerun.experimental import ViewerClient
+
+    port = free_port()
+    child = subprocess.Popen(
+        [
+            rerun_program(),
+            "--headless",
+            "--bind",
+            LOOPBACK,
+            "--port",
+            str(port),
+            "--window-size",
+            f"{window[0]}x{window[1]}",
+            str(rrd),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        _await_port(port, child)
+        client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
+        time.sleep(_TOAST_SECONDS)
+        before = b""
+        deadline = time.monotonic() + _SETTLE_SECONDS
+        while time.monotonic() < deadline:
+            now = client.take_screenshot()
+            if now == before:
+                break
+            before = now
+            time.sleep(_POLL_SECONDS)
+        with replacing(picture) as beside:
+            beside.write_bytes(before)
+    except OSError as error:
+        raise DataError(f"{picture}: cannot be written: {error.strerror or error}") from error
+    except (RuntimeError, ConnectionError, DataError) as error:
+        raise DataError(
+            "no screenshot: Rerun's headless viewer needs a Vulkan driver "
+            f"(Debian: mesa-vulkan-drivers): {error}"
+        ) from error
+    finally:
+        child.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=5)
+        if child.poll() is None:
+            child.kill()
