@@ -203,7 +203,7 @@ class DepthCloud(Stage):
         if calibration is not None:
             low, high = calibration.near_z_m, calibration.far_z_m
             middle = (low + high) / 2
-            ticks = tuple(f"{1e3 * z:.0f} mm" for z in (low, middle, high))
+            ticks = (f"{1e3 * low:.0f} mm", f"{1e3 * middle:.0f} mm", f"{1e3 * high:.0f} mm")
             show.log_map(recording, "depth_cloud/depth", depth_m, low, high, "turbo", ticks)
         else:
             show.log_map(
@@ -251,12 +251,11 @@ class DepthCloud(Stage):
             )
         recording.log("depth_cloud/coverage", rr.Scalars(float(np.isfinite(depth_m).mean())))
         truth = logged.truth
-        if truth is not None and truth.depth_m is not None and calibration is not None:
-            if truth.depth_m.shape == depth_m.shape:
-                error_mm = (depth_m - truth.depth_m) * np.float32(1e3)
-                show.log_signed_error(
-                    recording, "depth_cloud/error_mm", error_mm, _ERROR_PICTURE_MM
-                )
+        if calibration is None or truth is None or truth.depth_m is None:
+            return
+        if truth.depth_m.shape == depth_m.shape:
+            error_mm = (depth_m - truth.depth_m) * np.float32(1e3)
+            show.log_signed_error(recording, "depth_cloud/error_mm", error_mm, _ERROR_PICTURE_MM)
 
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb

@@ -7,7 +7,8 @@ painted over it in grey, for Rerun would give it the colour of the smallest valu
 
 from __future__ import annotations
 
-from typing import Any
+from itertools import pairwise
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -17,11 +18,11 @@ import rerun.blueprint as rrb
 UNKNOWN_COLOUR = (62, 62, 70)
 _BAR_STEPS = 64
 _BAR_ROOM = 1.3
-_TURBO, _MAGMA, _VIRIDIS = "turbo", "magma", "viridis"
+Colours = Literal["turbo", "magma", "viridis"]
 _OPENCV_MAPS = {
-    _TURBO: cv2.COLORMAP_TURBO,
-    _MAGMA: cv2.COLORMAP_MAGMA,
-    _VIRIDIS: cv2.COLORMAP_VIRIDIS,
+    "turbo": cv2.COLORMAP_TURBO,
+    "magma": cv2.COLORMAP_MAGMA,
+    "viridis": cv2.COLORMAP_VIRIDIS,
 }
 
 
@@ -46,7 +47,7 @@ def log_map(
     image: np.ndarray,
     low: float,
     high: float,
-    colours: str,
+    colours: Colours,
     ticks: tuple[str, str, str],
 ) -> None:
     """Log a float map [H W] under ``path``, with its unknown pixels and a colour bar.
@@ -98,7 +99,7 @@ _RED = np.array([220.0, 40.0, 40.0])
 
 
 def _log_bar(
-    recording: Any, path: str, shape: tuple[int, ...], colours: str, ticks: tuple[str, str, str]
+    recording: Any, path: str, shape: tuple[int, ...], colours: Colours, ticks: tuple[str, str, str]
 ) -> None:
     levels = np.linspace(255, 0, _BAR_STEPS).astype(np.uint8)[:, None]
     table = cv2.applyColorMap(levels, _OPENCV_MAPS[colours])[:, 0, ::-1]
@@ -118,7 +119,7 @@ def _log_bar_strips(
     recording.log(
         f"{path}/bar",
         rr.LineStrips2D(
-            [[(left, a), (left, b)] for a, b in zip(rows, rows[1:], strict=False)],
+            [[(left, a), (left, b)] for a, b in pairwise(rows)],
             colors=colours,
             radii=width * 0.02,
         ),

@@ -246,7 +246,7 @@ def calibrate(
     )
 
 
-def _terminate(signum: int, frame: Any) -> None:
+def _terminate(_signum: int, _frame: Any) -> None:
     raise Terminated
 
 

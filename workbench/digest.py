@@ -20,7 +20,7 @@ _DIGEST_BYTES = 16
 def digest_of(parts: Iterable[Any]) -> str:
     """A hex digest of a sequence of strings, bytes, numbers, None and numpy arrays.
 
-    Each part is framed by its type and length, so that ``("ab", "c")`` differs from ``("a", "bc")``.
+    Each part is framed by its type and length, so that ``("ab", "c")`` is not ``("a", "bc")``.
     """
     h = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for part in parts:

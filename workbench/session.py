@@ -107,7 +107,9 @@ def resources_beside(recording: Path, stages: Mapping[str, Stage]) -> dict[str, 
             if isinstance(need, Resource) and need.filename:
                 own = recording.with_name(f"{recording.stem}.{need.filename}")
                 shared = recording.with_name(need.filename)
-                found.update({need.name: path for path in (shared, own) if path.is_file()})
+                for path in (shared, own):
+                    if path.is_file():
+                        found[need.name] = path
     return found
 
 

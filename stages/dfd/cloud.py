@@ -31,7 +31,7 @@ def cloud_from_depth(
     filled = np.where(known, depth_m, np.float32(0))
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     cloud = o3d.geometry.PointCloud.create_from_depth_image(
-        o3d.geometry.Image(np.ascontiguousarray(filled)),
+        o3d.geometry.Image(np.ascontiguousarray(filled)),  # type: ignore[call-overload]
         o3d.camera.PinholeCameraIntrinsic(width, height, fx, fy, cx, cy),
         depth_scale=1.0,
         depth_trunc=float("inf"),

@@ -101,7 +101,7 @@ def find_dots(image: np.ndarray) -> np.ndarray:
         return np.zeros((0, 2))
     bytes_ = np.clip(values * (255 / top), 0, 255).astype(np.uint8)
     _, mask = cv2.threshold(bytes_, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    count, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return np.zeros((0, 2))
     areas = stats[1:, cv2.CC_STAT_AREA]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import typer
@@ -61,10 +62,8 @@ def run(
         if stream.web_url is not None and not report.interrupted:
             err.print("serving until Ctrl-C", style="dim")
             stream.recording.flush()
-            try:
+            with suppress(KeyboardInterrupt):
                 stream.wait_for_viewer()
-            except KeyboardInterrupt:
-                pass
     if json_report is not None:
         text = to_json(report.as_dict())
         if str(json_report) == "-":
