@@ -213,7 +213,7 @@ class DepthCloud(Stage):
                 0,
                 1,
                 "turbo",
-                ("0 near", "relative: NO CALIBRATION", "1 far"),
+                ("0 near", "relative", "1 far"),
             )
         show.log_map(
             recording, "depth_cloud/confidence", confidence, 0, 1, "viridis", ("0", "0.5", "1")

@@ -36,9 +36,9 @@ _GAIN_WARNING = 0.01
 class Registration(Stage):
     """Takes the far image onto the near image's grid, and makes an image without stripes.
 
-    The similarity comes from the calibration; without one it can be measured on the frame
-    itself.  What misalignment is left, and how the balance of light between the sensors has
-    drifted since the calibration, are measured on every frame and told.
+    The similarity comes from the calibration; without one it is measured on the frame itself.
+    What misalignment is left, and how the balance of light between the sensors has drifted since
+    the calibration, are measured on every frame and told.
     """
 
     name = "registration"
@@ -48,8 +48,8 @@ class Registration(Stage):
     class Parameters(StageParameters):
         similarity: Literal["calibration", "pair", "none"] = knob(
             "calibration",
-            "Where the far-to-near map comes from: the calibration (none is done without one), "
-            "this frame's own image pair, or nowhere.",
+            "Where the far-to-near map comes from: the calibration (without one, the pair), "
+            "each frame's own image pair, or nowhere.",
         )
         intensity: Literal["flat", "stripes"] = knob(
             "flat",
@@ -74,6 +74,7 @@ class Registration(Stage):
         import cv2
         import numpy as np
 
+        from stages.dfd.calibration import light_ratio
         from stages.dfd.images import full_scale, grey
         from stages.dfd.similarity import Similarity, misalignment_rms_px, refine_similarity
         from stages.dfd.similarity import warp_to_near as warp
@@ -99,7 +100,9 @@ class Registration(Stage):
                 )
             if parameters.similarity == "calibration":
                 similarity = known
-        if parameters.similarity == "pair":
+        if parameters.similarity == "pair" or (
+            parameters.similarity == "calibration" and calibration is None
+        ):
             similarity = refine_similarity([(near, far)], similarity)
         limit = parameters.saturation_percent / 100 * full_scale(near_raw, far_raw)
         saturated = (near >= limit) | ~np.isfinite(near)
@@ -112,7 +115,7 @@ class Registration(Stage):
 
         gain_drift = 1.0
         if calibration is not None:
-            gain_drift = _light_ratio(near, far) / calibration.gain_near_over_far
+            gain_drift = light_ratio(near, far, calibration.gain_map)
             if abs(gain_drift - 1) > _GAIN_WARNING:
                 done = "corrected" if parameters.correct_gain else "not corrected"
                 warnings.append(
@@ -177,13 +180,6 @@ class Registration(Stage):
                 "saturation_percent",
             )
         ]
-
-
-def _light_ratio(near: Any, far: Any) -> float:
-    """All light on the near sensor over all on the far one: blur moves light, it loses none."""
-    far_light = float(far.sum(dtype="float64"))
-    near_light = float(near.sum(dtype="float64"))
-    return near_light / far_light if near_light > 0 and far_light > 0 else 1.0
 
 
 def _size(image: Any) -> str:

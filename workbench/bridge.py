@@ -33,7 +33,7 @@ class Bridge:
         self.session = session
         self.recording = recording
         self._defects_told = -1
-        self._laid_out = False
+        self._laid_out: set[str] = set()
 
     def log(self, run: Run, report: RunReport, scores: Mapping[str, float]) -> None:
         """One run: inputs, every stage's pictures, and the bench's own numbers."""
@@ -55,11 +55,14 @@ class Bridge:
         for name, value in scores.items():
             recording.log(f"bench/scores/{name}", rr.Scalars(value))
         self._log_defects(report, broken)
-        self._log_graph(broken)
+        self._log_graph(run, broken)
+        shown = {stage.name for stage in self.session.pipeline.stages} - set(broken)
         if not self._laid_out:
             self._log_once(scores)
-            recording.send_blueprint(self.blueprint(run, bool(scores)))
-            self._laid_out = True
+        if not self._laid_out >= shown | {"bench"}:
+            # The first frame, or the first on which a stage that failed before came through.
+            self._laid_out |= shown | {"bench"}
+            recording.send_blueprint(self.blueprint(run, bool(scores), broken))
 
     def close(self, report: RunReport) -> None:
         """What is known only at the end: the recording's defects in full, and how it pairs."""
@@ -132,10 +135,10 @@ class Bridge:
             "bench/defects", rr.TextDocument("\n".join(lines), media_type="text/markdown")
         )
 
-    def _log_graph(self, broken: Mapping[str, str]) -> None:
+    def _log_graph(self, run: Run, broken: Mapping[str, str]) -> None:
         pipeline = self.session.pipeline
         edges = sorted({(giver, taker) for giver, taker, _ in dependencies(pipeline.stages)})
-        available = self._available()
+        available = self._available(run)
         names = {s.name for s in pipeline.stages}
         edges = [(a, b) for a, b in edges if a in names or a in available]
         sources = sorted({giver for giver, _ in edges} - names)
@@ -149,22 +152,26 @@ class Bridge:
             rr.GraphEdges(edges, graph_type="directed"),
         )
 
-    def _available(self) -> set[str]:
+    def _available(self, run: Run) -> set[str]:
         pipeline = self.session.pipeline
         images = pipeline.sources(RecordedImage)
-        there = self.session.recording.channel_topics
         cameras = pipeline.sources(RecordedCamera)
         resources = pipeline.sources(Resource)
         return (
-            {i.name for i in images if i.channel in there}
-            | {c.name for c in cameras if c.channel in there}
+            {i.name for i in images if i.channel in run.frame.images}
+            | {c.name for c in cameras if c.channel in run.frame.cameras}
             | {r.name for r in resources if r.name in pipeline.resources}
         )
 
     # -- the layout -------------------------------------------------------------------------------
 
-    def blueprint(self, run: Run, scored: bool) -> rrb.Blueprint:
-        """One row that reads from left to right, stage after stage, and a shelf below it."""
+    def blueprint(
+        self, run: Run, scored: bool, broken: Mapping[str, str] | None = None
+    ) -> rrb.Blueprint:
+        """One row that reads from left to right, stage after stage, and a shelf below it.
+
+        Stages in ``broken`` have nothing to show; their errors are among the defects.
+        """
         columns: list[Any] = [
             rrb.Vertical(
                 *(
@@ -176,6 +183,8 @@ class Bridge:
         ]
         shares = [1.0]
         for stage in self.session.pipeline.stages:
+            if stage.name in (broken or {}):
+                continue
             for view in stage.views(self._logged(run, stage.name)):
                 columns.append(view)
                 shares.append(1.7 if isinstance(view, rrb.Spatial3DView) else 1.0)

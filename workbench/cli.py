@@ -252,15 +252,10 @@ def _terminate(_signum: int, _frame: Any) -> None:
 
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
-    import click
-
     signal.signal(signal.SIGTERM, _terminate)
     try:
         code = app(standalone_mode=False) or 0
-    except click.ClickException as error:
-        error.show()
-        code = error.exit_code
-    except click.Abort as error:
+    except typer.Abort as error:
         terminated = isinstance(error.__cause__, Terminated)
         code = EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except UsageError as error:
@@ -269,4 +264,10 @@ def main() -> None:
     except (DataError, OSError) as error:
         print(f"workbench: {error}", file=sys.stderr)
         code = EXIT_FAILED
+    except Exception as error:
+        # A wrong flag.  Typer carries its own click, whose base class it does not export.
+        if not hasattr(error, "show"):
+            raise
+        error.show()
+        code = EXIT_USAGE
     sys.exit(code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -75,7 +76,8 @@ def score_rows(stage: str, scores: Iterable[Score]) -> Iterator[tuple[str, ...]]
     """Scores as table rows: stage, figure, value, unit, covered, note."""
     for score in scores:
         covered = "" if score.coverage is None else f"{100 * score.coverage:.1f} %"
-        yield (stage, score.name, f"{score.value:.3f}", score.unit, covered, score.note)
+        value = f"{score.value:.3f}" if math.isfinite(score.value) else "none"
+        yield (stage, score.name, value, score.unit, covered, score.note)
 
 
 SCORE_COLUMNS = ("stage", "figure", "value", "unit", "covered", "note")

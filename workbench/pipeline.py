@@ -154,7 +154,7 @@ class Pipeline:
         stage_ms: dict[str, float] = {}
         computed: set[str] = set()
         for stage in self.stages:
-            lacking = [n.name for n in stage.needs if n.required and artifacts.get(n.name) is None]
+            lacking = [n.name for n in stage.needs if n.required and n.name not in artifacts]
             if lacking:
                 failures.append(_lacking(stage, lacking, failed_givers))
                 failed_givers.update(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import zipfile
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,24 @@ FORMAT = "defocus-calibration"
 VERSION = 1
 
 
+def gain_terms(height: int, width: int) -> np.ndarray:
+    """The terms 1, x, y, x², xy, y² at every pixel, float64 [H W 6]; see ``Calibration.gain``."""
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def light_ratio(near: np.ndarray, far: np.ndarray, gain_map: np.ndarray | None = None) -> float:
+    """All light on the near sensor over all on the far one [H W], as calibrated; 1 is no drift.
+
+    Blur moves light about and loses none, so the ratio holds whatever the scene.
+    """
+    far_light = float(far.sum(dtype=np.float64))
+    if gain_map is not None:
+        far_light = float(np.einsum("ij,ij->", far, gain_map, dtype=np.float64))
+    near_light = float(near.sum(dtype=np.float64))
+    return near_light / far_light if near_light > 0 and far_light > 0 else 1.0
+
+
 @dataclass(frozen=True)
 class Calibration:
     """Both steps of section 3.2.
@@ -29,7 +48,9 @@ class Calibration:
     ``curve`` [K H W] float32: coefficients of relative depth t over Q, lowest power first, for
     each pixel; t runs from 0 at ``near_z_m`` to 1 at ``far_z_m``, linear in 1/z.
     ``modulation`` [M] float32: coefficients of (focus_near + focus_far) / (near + far) over t.
-    ``gain_near_over_far``: ratio of all light on the two sensors.
+    ``gain`` [6] float64: light of a white scene on the near sensor over that on the far one, as
+    coefficients of 1, x, y, x², xy, y² with x and y from -1 to 1 over the image; vignetting is
+    not the same on both.
     ``report``: what the procedure measured, for people; plain JSON values.
     """
 
@@ -41,13 +62,19 @@ class Calibration:
     far_z_m: float
     modulation: np.ndarray
     noise: SensorNoise
-    gain_near_over_far: float
+    gain: np.ndarray
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
     def slope(self) -> float:
         """Mean |dt/dQ| at Q = 0: what an error of the ratio costs in relative depth."""
         return float(np.abs(self.curve[1]).mean())
+
+    @cached_property
+    def gain_map(self) -> np.ndarray:
+        """``gain`` at every pixel, float32 [H W]."""
+        height, width = self.curve.shape[1:]
+        return (gain_terms(height, width) @ self.gain).astype(np.float32)
 
     def z_m(self, relative_depth: np.ndarray) -> np.ndarray:
         """Metres along the optical axis from relative depth, float32."""
@@ -70,7 +97,7 @@ class Calibration:
             "range_m": np.array([self.near_z_m, self.far_z_m]),
             "modulation": self.modulation.astype(np.float32, copy=False),
             "noise": np.array([self.noise.read_variance, self.noise.gain]),
-            "gain_near_over_far": np.array(self.gain_near_over_far),
+            "gain": self.gain,
             "report": np.array(json.dumps(self.report, sort_keys=True)),
         }
         with replacing(path) as beside, beside.open("wb") as file:
@@ -109,7 +136,7 @@ class Calibration:
                     far_z_m,
                     file["modulation"],
                     SensorNoise(*(float(v) for v in file["noise"])),
-                    float(file["gain_near_over_far"]),
+                    file["gain"],
                     json.loads(str(file["report"])),
                 )
         except (zipfile.BadZipFile, KeyError, EOFError) as error:

@@ -15,8 +15,9 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.optimize import nnls
 
-from stages.dfd.calibration import Calibration
+from stages.dfd.calibration import Calibration, gain_terms, light_ratio
 from stages.dfd.depth import windows_for
 from stages.dfd.focus import LaplacianKind, SensorNoise, focus_map
 from stages.dfd.images import full_scale, grey
@@ -39,7 +40,11 @@ _PLANE_RMS_MM = 0.5
 _FLATTEST_SLOPE = 0.15
 _MODULATION_TERMS = 5
 _NOISE_LEVELS = 24
+_NOISE_MIN_SAMPLES = 500
+_QUANTISATION = 1 / 12
+_SAME_PLACE_M = 1e-6
 _MIN_PLANES = 5
+_GAIN_CELLS = 16
 
 
 class CalibrateParameters(StageParameters):
@@ -100,8 +105,8 @@ def calibrate(
     similarity, step_one = _register(frames)
     progress("stripes, light and noise")
     stripes = _stripes(frames, similarity)
-    gain, gain_spread = _gain(frames, similarity)
-    noise, noise_source = _noise(frames)
+    gain, gain_map, gain_spread = _gain(frames, similarity)
+    noise, noise_source = _noise(frames, stripes)
     side = stripes.extent_px()
     taps = whole_period_taps(side)
     windows = windows_for(side, parameters.smoothing_periods, 1.0)
@@ -109,7 +114,7 @@ def calibrate(
     def maps(frame: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Ratio, sum of focus and brightness of a frame, over the windows of depth_cloud."""
         near, far = _registered(frame, similarity)
-        far = far * np.float32(_light_ratio(near, far) / gain)
+        far = far * np.float32(light_ratio(near, far, gain_map))
 
         def pooled(image: np.ndarray) -> np.ndarray:
             energy = focus_map(image, taps, taps, laplacian, noise) ** 2
@@ -176,7 +181,8 @@ def calibrate(
         "stripe_period_px": stripes.period_px,
         "stripe_direction_deg": stripes.angle_deg,
         "stripe_strength": stripes.strength,
-        "gain_near_over_far": gain,
+        "gain_near_over_far": float(gain_map.mean()),
+        "gain_over_the_image": [float(gain_map.min()), float(gain_map.max())],
         "gain_spread_percent": gain_spread,
         "noise_read_variance": noise.read_variance,
         "noise_shot_gain": noise.gain,
@@ -255,10 +261,6 @@ def _middle(z_m: np.ndarray, ratio: np.ndarray) -> tuple[float, float]:
 
 def _smooth(image: np.ndarray, taps: np.ndarray) -> np.ndarray:
     return cv2.sepFilter2D(image, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101)
-
-
-def _light_ratio(near: np.ndarray, far: np.ndarray) -> float:
-    return float(near.sum(dtype=np.float64)) / max(float(far.sum(dtype=np.float64)), 1e-9)
 
 
 # -- step one -------------------------------------------------------------------------------------
@@ -363,53 +365,97 @@ def _stripes(frames: Frames, similarity: Similarity) -> Stripes:
     )
 
 
-def _gain(frames: Frames, similarity: Similarity) -> tuple[float, float]:
-    """Median ratio of all light, near over far, and its spread (standard deviation) in percent."""
-    ratios = [_light_ratio(*_registered(frame, similarity)) for frame, _ in _planes(frames)]
-    middle = float(np.median(ratios))
-    return middle, 100 * float(np.std(ratios)) / middle
+def _gain(frames: Frames, similarity: Similarity) -> tuple[np.ndarray, np.ndarray, float]:
+    """Light on the near sensor over that on the far one: coefficients [6], map [H W], spread.
 
-
-def _noise(frames: Frames) -> tuple[SensorNoise, str]:
-    """Photon transfer: variance against grey level, from successive shots of one plane.
-
-    Half the variance of the difference of two shots is the temporal variance of one; grey levels
-    are binned, and a line with weights fitted.  Where no plane was shot twice, the variance of
-    quantisation alone is taken.
+    The images are averaged over 16×16 cells, which no stripe survives, and a quadratic is fitted
+    to the cells' ratios over all planes.  The spread is the standard deviation of the planes'
+    drift against it, in percent.
     """
-    level_sum = np.zeros(_NOISE_LEVELS)
-    square_sum = np.zeros(_NOISE_LEVELS)
-    count = np.zeros(_NOISE_LEVELS)
+    near_light = np.zeros((_GAIN_CELLS, _GAIN_CELLS))
+    far_light = np.zeros((_GAIN_CELLS, _GAIN_CELLS))
+    shape = (0, 0)
+    for frame, _ in _planes(frames):
+        near, far = _registered(frame, similarity)
+        shape = near.shape
+        size = (_GAIN_CELLS, _GAIN_CELLS)
+        near_light += cv2.resize(near, size, interpolation=cv2.INTER_AREA)
+        far_light += cv2.resize(far, size, interpolation=cv2.INTER_AREA)
+    ratio = near_light / np.maximum(far_light, 1e-9)
+    terms = gain_terms(_GAIN_CELLS, _GAIN_CELLS).reshape(-1, 6)
+    # The cells' centres lie half a cell inside the image's border.
+    inner = 1 - 1 / _GAIN_CELLS
+    terms = terms * np.array([1, inner, inner, inner**2, inner**2, inner**2])
+    gain = np.linalg.lstsq(terms, ratio.ravel(), rcond=None)[0]
+    gain_map = (gain_terms(*shape) @ gain).astype(np.float32)
+    drifts = [
+        light_ratio(*_registered(frame, similarity), gain_map) for frame, _ in _planes(frames)
+    ]
+    return gain, gain_map, 100 * float(np.std(drifts))
+
+
+class _PhotonTransfer:
+    """Variance against grey level, gathered in bins."""
+
+    def __init__(self) -> None:
+        self.count = np.zeros(_NOISE_LEVELS)
+        self.level = np.zeros(_NOISE_LEVELS)
+        self.variance = np.zeros(_NOISE_LEVELS)
+        self.top = 0.0
+
+    def add(self, recorded: np.ndarray, level: np.ndarray, squared: np.ndarray) -> None:
+        """Samples [N] of the variance at grey levels [N] of an image of ``recorded``'s type."""
+        if not self.top:
+            self.top = full_scale(recorded)
+            if not math.isfinite(self.top):
+                self.top = float(np.nanmax(recorded))
+        usable = (level < 0.95 * self.top) & (level > 0)
+        bins = np.minimum((level[usable] / self.top * _NOISE_LEVELS).astype(int), _NOISE_LEVELS - 1)
+        self.count += np.bincount(bins, minlength=_NOISE_LEVELS)
+        self.level += np.bincount(bins, level[usable], minlength=_NOISE_LEVELS)
+        self.variance += np.bincount(bins, squared[usable], minlength=_NOISE_LEVELS)
+
+    def fit(self, terms: int) -> SensorNoise | None:
+        """Read and shot noise of a non-negative polynomial in the level; None with too little."""
+        good = self.count > _NOISE_MIN_SAMPLES
+        if int(good.sum()) < 2:
+            return None
+        level, variance = (v[good] / self.count[good] for v in (self.level, self.variance))
+        weight = np.sqrt(self.count[good]) / np.maximum(variance, 1e-9)
+        design = np.vander(level, min(terms, int(good.sum())), increasing=True)
+        fitted, _ = nnls(design * weight[:, None], variance * weight)
+        return SensorNoise(max(float(fitted[0]), _QUANTISATION), float(fitted[1]))
+
+
+def _noise(frames: Frames, stripes: Stripes) -> tuple[SensorNoise, str]:
+    """Temporal noise, by photon transfer on the planes.
+
+    From successive shots of one plane: half the squared difference of two is the variance of
+    one.  Where no plane was shot twice, from the second difference along the stripes, where the
+    image is smooth; that contains the pixels' fixed pattern, which grows with the square of the
+    level, and is fitted and left out.
+    """
+    repeated, single = _PhotonTransfer(), _PhotonTransfer()
     before: tuple[float, dict[str, np.ndarray]] | None = None
-    top = 0.0
     for frame, z_m in _planes(frames):
         z = float(z_m.mean())
         images = {c: frame.images[c] for c in ("near", "far")}
-        if before is not None and abs(before[0] - z) < 1e-6:
-            top = top or full_scale(*images.values())
-            if not math.isfinite(top):
-                top = max(float(np.nanmax(image)) for image in images.values())
-            for channel, image in images.items():
-                a, b = grey(image), grey(before[1][channel])
-                mean, difference = (a + b) / 2, a - b
-                usable = (mean < 0.95 * top) & (mean > 0)
-                bins = (mean[usable] / top * _NOISE_LEVELS).astype(int)
-                bins = np.minimum(bins, _NOISE_LEVELS - 1)
-                count += np.bincount(bins, minlength=_NOISE_LEVELS)
-                level_sum += np.bincount(bins, mean[usable], minlength=_NOISE_LEVELS)
-                square_sum += np.bincount(bins, difference[usable] ** 2, minlength=_NOISE_LEVELS)
+        for channel, image in images.items():
+            now = grey(image)
+            if before is not None and abs(before[0] - z) < _SAME_PLACE_M:
+                other = grey(before[1][channel])
+                repeated.add(image, ((now + other) / 2).ravel(), ((now - other) ** 2).ravel() / 2)
+            along = now if stripes.upright else now.T
+            second = along[:-2] - 2 * along[1:-1] + along[2:]
+            single.add(image, along[1:-1].ravel(), (second**2).ravel() / 6)
         before = (z, images)
-    good = count > 500
-    if int(good.sum()) < 2:
-        return SensorNoise(), "quantisation only: no plane was shot twice"
-    level, variance = level_sum[good] / count[good], square_sum[good] / count[good] / 2
-    design = np.stack([np.ones_like(level), level], axis=1)
-    weight = np.sqrt(count[good]) / variance
-    read, gain = np.linalg.lstsq(design * weight[:, None], variance * weight, rcond=None)[0]
-    return (
-        SensorNoise(max(float(read), 1 / 12), max(float(gain), 0.0)),
-        f"{int(count.sum()) // 1000} thousand pixel pairs of repeated shots",
-    )
+    fitted = repeated.fit(2)
+    if fitted is not None:
+        return fitted, "repeated shots of planes"
+    fitted = single.fit(3)
+    if fitted is not None:
+        return fitted, "single shots of planes, along the stripes"
+    return SensorNoise(), "quantisation only: too few pixels"
 
 
 # -- step two -------------------------------------------------------------------------------------

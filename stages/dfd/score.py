@@ -23,11 +23,11 @@ INTERIOR_PX = 8
 EDGE_PX = 4
 MAX_TILT_DEG = 40
 NORMAL_MIN_PX = 500
+MIN_FACE_COVERAGE = 0.5
 PATCH_PX = 32
 
 _BIN_MM = 0.005
 _BINS = 20_000
-_MIN_FIT_PX = 60
 _GRAZING_DEG = 80
 _PLANE_RMS_MM = 0.3
 
@@ -159,7 +159,11 @@ class _Errors:
 
 
 class DepthScorer(Scorer):
-    """Figures of the depth against ``truth``; frames without truth or calibration are skipped."""
+    """Figures of the depth against ``truth``.
+
+    Frames without truth or calibration are skipped, and so are printed dot grids, on which no
+    pattern is projected.
+    """
 
     def __init__(self) -> None:
         self.interior = _Errors()
@@ -167,6 +171,7 @@ class DepthScorer(Scorer):
         self.table = _Errors()
         self.planes = _Errors()
         self.normals_deg: list[float] = []
+        self.normal_faces = 0
         self.worst_patch_mm = math.nan
         self.stand_off_m = math.nan
         self.span_m = math.nan
@@ -176,7 +181,7 @@ class DepthScorer(Scorer):
         calibration, camera = artifacts.get("calibration"), artifacts.get("near_camera")
         if calibration is None or truth is None or truth.depth_m is None:
             return {}
-        if truth.depth_m.shape != depth_m.shape:
+        if truth.depth_m.shape != depth_m.shape or truth.meta.get("kind") == "grid":
             return {}
         self.span_m = calibration.far_z_m - calibration.near_z_m
         self.stand_off_m = (calibration.far_z_m + calibration.near_z_m) / 2
@@ -229,8 +234,9 @@ class DepthScorer(Scorer):
         for face in scene.faces:
             if int(face.mask.sum()) < NORMAL_MIN_PX or face.tilt_deg > _GRAZING_DEG:
                 continue
+            self.normal_faces += 1
             pixels = face.mask & known
-            if int(pixels.sum()) < 0.5 * int(face.mask.sum()):
+            if int(pixels.sum()) < MIN_FACE_COVERAGE * int(face.mask.sum()):
                 continue
             normal, _ = fit_plane(depth_m, pixels, camera, weights=confidence**2)
             cosine = float(np.clip(normal @ face.normal, -1, 1))
@@ -253,10 +259,12 @@ class DepthScorer(Scorer):
                 Score("table bias", table.mean, "mm", table.coverage),
             ]
         if self.normals_deg:
-            note = f"{len(self.normals_deg)} faces over {NORMAL_MIN_PX} px"
+            measured, worst = len(self.normals_deg), float(np.max(self.normals_deg))
+            note = f"{measured} of {self.normal_faces} faces over {NORMAL_MIN_PX} px"
+            share = measured / self.normal_faces
             scores += [
-                Score("normals, mean", float(np.mean(self.normals_deg)), "deg", note=note),
-                Score("normals, worst", float(np.max(self.normals_deg)), "deg", note=note),
+                Score("normals, mean", float(np.mean(self.normals_deg)), "deg", share, note),
+                Score("normals, worst", worst, "deg", share, note),
             ]
         if self.planes.pixels:
             planes = self.planes
