@@ -260,7 +260,7 @@ class DepthCloud(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import map_view
+        from stages.show import DARK, map_view
 
         shape = logged.artifacts["depth_m"].shape
         calibrated = logged.artifacts.get("calibration") is not None
@@ -284,6 +284,7 @@ class DepthCloud(Stage):
                     origin="world",
                     name="cloud, camera_optical_frame",
                     eye_controls=_eye(points),
+                    background=DARK,
                 )
             )
         return columns

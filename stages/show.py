@@ -16,6 +16,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 UNKNOWN_COLOUR = (62, 62, 70)
+DARK = (14, 14, 16)
+_TICK_COLOUR = (90, 150, 215)  # readable on the labels of the dark and of the light theme
 _BAR_STEPS = 64
 _BAR_ROOM = 1.3
 Colours = Literal["turbo", "magma", "viridis"]
@@ -130,7 +132,7 @@ def _log_bar_strips(
         rr.Points2D(
             [(left + width * 0.13, y) for y in (0.02 * height, 0.47 * height, 0.91 * height)],
             labels=[high, middle, low],
-            colors=[_WHITE.astype(np.uint8)] * 3,
+            colors=[_TICK_COLOUR] * 3,
             radii=0.05,
             show_labels=True,
         ),
@@ -143,6 +145,7 @@ def map_view(path: str, name: str, shape: tuple[int, ...]) -> Any:
     return rrb.Spatial2DView(
         origin=path,
         name=name,
+        background=DARK,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(0, width * _BAR_ROOM), y_range=(-0.02 * height, 1.02 * height)
         ),

@@ -44,6 +44,9 @@ _NOISE_MIN_SAMPLES = 500
 _QUANTISATION = 1 / 12
 _SAME_PLACE_M = 1e-6
 _MIN_PLANES = 5
+_RANGE_MARGIN = 0.02
+_DEGREES = (3, 4, 5, 6)
+_AS_GOOD = 1.03
 _GAIN_CELLS = 16
 
 
@@ -51,9 +54,10 @@ class CalibrateParameters(StageParameters):
     """The knobs of the procedure."""
 
     degree: int = knob(
-        4,
-        "Degree of the curve that takes the focus ratio to depth; fewer planes need a lower one.",
-        low=1,
+        0,
+        "Degree of the curve that takes the focus ratio to depth; 0 takes the one that predicts "
+        "planes best which it has not seen.",
+        low=0,
         high=6,
         step=1,
     )
@@ -83,6 +87,15 @@ class _Plane:
     index: int
     z_m: float
     ratio: float
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """The middle 32×32 of a calibration frame: ratio and true relative depth, [32 32] each."""
+
+    z_m: float
+    ratio: np.ndarray
+    target: np.ndarray
 
 
 Frames = Callable[[], Iterator[Any]]
@@ -127,24 +140,24 @@ def calibrate(
     progress("step 2: working range")
     planes = [_Plane(frame.index, *_middle(z_m, maps(frame)[0])) for frame, z_m in _planes(frames)]
     near_z_m, far_z_m, range_note = _working_range(planes, rig)
-    used = [p for p in planes if near_z_m - 0.004 <= p.z_m <= far_z_m + 0.004]
+    margin_m = _RANGE_MARGIN * (far_z_m - near_z_m)
+    used = [p for p in planes if near_z_m - margin_m <= p.z_m <= far_z_m + margin_m]
     distances = sorted({round(p.z_m, 5) for p in used})
     if len(distances) < _MIN_PLANES:
         raise ValueError(
             f"expected planes at {_MIN_PLANES} distances or more within the working range, "
             f"found {len(distances)}"
         )
-    degree = min(parameters.degree, len(distances) - 2)
-
-    progress("step 2: curve of every pixel")
     inverse_near, inverse_far = 1 / near_z_m, 1 / far_z_m
 
     def relative(z_m: np.ndarray) -> np.ndarray:
         return (1 / z_m - inverse_near) / (inverse_far - inverse_near)
 
-    normal = _NormalEquations(degree)
+    progress("step 2: curve of every pixel")
+    highest = min(parameters.degree or max(_DEGREES), len(distances) - 2)
+    normal = _NormalEquations(highest)
     modulation_points: list[tuple[np.ndarray, np.ndarray]] = []
-    patches: list[tuple[float, np.ndarray, np.ndarray]] = []
+    patches: list[_Patch] = []
     chosen = {p.index for p in used}
     for frame, z_m in _planes(frames):
         if frame.index not in chosen:
@@ -152,12 +165,23 @@ def calibrate(
         ratio, energy, light = maps(frame)
         target = relative(z_m).astype(np.float32)
         middle = _middle_slice(ratio.shape)
-        patches.append((float(np.median(z_m[middle])), ratio[middle], target[middle]))
+        patches.append(
+            _Patch(round(float(np.median(z_m[middle])), 5), ratio[middle], target[middle])
+        )
         some = (slice(None, None, 16), slice(None, None, 16))
         modulation_points.append((target[some].ravel(), (energy / (light + 1e-6))[some].ravel()))
         size = (parameters.neighbourhood_px,) * 2
         normal.add(cv2.blur(ratio, size, borderType=cv2.BORDER_REFLECT_101), target)
-    curve = normal.solve()
+    progress("step 2: planes held back")
+    span_m = far_z_m - near_z_m
+    candidates = [parameters.degree] if parameters.degree else _DEGREES
+    tried = {d: _held_out(patches, d) for d in candidates if d <= highest} or {
+        highest: _held_out(patches, highest)
+    }
+    best = min(rms for rms, _ in tried.values())
+    # The lowest degree that is as good as the best one, for it extrapolates more calmly.
+    degree = min(d for d, (rms, _) in tried.items() if rms <= _AS_GOOD * best)
+    curve = normal.solve(degree)
     modulation = _fit_modulation(modulation_points)
 
     calibration = Calibration(
@@ -173,8 +197,9 @@ def calibrate(
     )
     progress("report")
     stand_off_mm = 500 * (near_z_m + far_z_m)
-    span_mm = 1e3 * (far_z_m - near_z_m)
-    held_out = _held_out(patches, degree, calibration)
+    span_mm = 1e3 * span_m
+    # Relative depth is linear in dioptres; the middle's scale is the mean one.
+    held_out_rms, held_out = (span_mm * error for error in tried[degree])
     fit_rms, fit_worst = _fit_residuals(patches, calibration)
     report = {
         "registration": step_one,
@@ -197,6 +222,7 @@ def calibrate(
         "fit_rms_mm": fit_rms,
         "fit_worst_mm": fit_worst,
         "linearity_percent_of_span": _linearity(used),
+        "held_out_rms_mm": held_out_rms,
         "held_out_worst_mm": held_out,
         "held_out_worst_percent_of_stand_off": 100 * held_out / stand_off_mm,
         "held_out_worst_percent_of_span": 100 * held_out / span_mm,
@@ -517,17 +543,17 @@ class _NormalEquations:
                 self.products[k] += power * target
             power *= ratio
 
-    def solve(self) -> np.ndarray:
-        """Coefficients, lowest power first, float32 [degree + 1 H W]."""
+    def solve(self, degree: int | None = None) -> np.ndarray:
+        """Coefficients of this or a lower degree, lowest power first, float32 [degree + 1 H W]."""
         assert self.powers is not None and self.products is not None
-        terms = self.degree + 1
+        terms = (self.degree if degree is None else degree) + 1
         shape = self.products.shape[1:]
         curve = np.empty((terms, *shape), np.float32)
         order = np.add.outer(np.arange(terms), np.arange(terms))
         for row in range(shape[0]):
             matrix = np.moveaxis(self.powers[:, row][order], -1, 0)
             matrix = matrix + 1e-9 * np.eye(terms)
-            right = self.products[:, row].T[..., None]
+            right = self.products[:terms, row].T[..., None]
             curve[:, row] = np.linalg.solve(matrix, right)[..., 0].T
         return curve
 
@@ -543,40 +569,36 @@ def _fit_modulation(points: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 # -- the report -----------------------------------------------------------------------------------
 
 
-def _held_out(
-    patches: list[tuple[float, np.ndarray, np.ndarray]], degree: int, calibration: Calibration
-) -> float:
-    """Worst error (mm) in the middle 32×32 of planes that their own curve has not seen.
+def _held_out(patches: list[_Patch], degree: int) -> tuple[float, float]:
+    """Root mean square and worst error of relative depth on planes that the curve has not seen.
 
-    Each distance between the first and the last is left out in turn (all its shots), and the
-    middle's curves are fitted to the others, just as the calibration itself is.
+    In the middle 32×32.  Each distance between the first and the last is left out in turn (all
+    its shots), and the middle's curves are fitted to the others as the calibration itself is.
     """
-    distances = sorted({round(z, 5) for z, _, _ in patches})
-    worst = 0.0
-    for left_out in distances[1:-1]:
+    squares, pixels, worst = 0.0, 0, 0.0
+    for left_out in sorted({patch.z_m for patch in patches})[1:-1]:
         normal = _NormalEquations(degree)
-        for z, ratio, target in patches:
-            if round(z, 5) != left_out:
-                normal.add(cv2.blur(ratio, (9, 9), borderType=cv2.BORDER_REFLECT_101), target)
+        for patch in patches:
+            if patch.z_m != left_out:
+                shared = cv2.blur(patch.ratio, (9, 9), borderType=cv2.BORDER_REFLECT_101)
+                normal.add(shared, patch.target)
         curve = normal.solve()
-        for z, ratio, target in patches:
-            if round(z, 5) == left_out:
-                error_mm = 1e3 * (
-                    calibration.z_m(_evaluate(curve, ratio)) - calibration.z_m(target)
-                )
-                worst = max(worst, float(np.abs(error_mm).max()))
-    return worst
+        for patch in patches:
+            if patch.z_m == left_out:
+                error = (_evaluate(curve, patch.ratio) - patch.target).astype(np.float64)
+                squares += float((error**2).sum())
+                pixels += error.size
+                worst = max(worst, float(np.abs(error).max()))
+    return math.sqrt(squares / pixels), worst
 
 
-def _fit_residuals(
-    patches: list[tuple[float, np.ndarray, np.ndarray]], calibration: Calibration
-) -> tuple[float, float]:
+def _fit_residuals(patches: list[_Patch], calibration: Calibration) -> tuple[float, float]:
     """Root mean square and worst residual (mm) of the fit in the middle 32×32 of each plane."""
     squares, pixels, worst = 0.0, 0, 0.0
-    for _, ratio, target in patches:
-        curve = calibration.curve[:, *_middle_slice(calibration.curve.shape[1:])]
-        t = _evaluate(curve, ratio)
-        error_mm = 1e3 * (calibration.z_m(t) - calibration.z_m(target)).astype(np.float64)
+    curve = calibration.curve[:, *_middle_slice(calibration.curve.shape[1:])]
+    for patch in patches:
+        t = _evaluate(curve, patch.ratio)
+        error_mm = 1e3 * (calibration.z_m(t) - calibration.z_m(patch.target)).astype(np.float64)
         squares += float((error_mm**2).sum())
         pixels += error_mm.size
         worst = max(worst, float(np.abs(error_mm).max()))

@@ -81,8 +81,10 @@ def measure_stripes(image: np.ndarray) -> Stripes | None:
     if strength < _PEAK_SHARE or power[near_peak].max() > power[row, column]:
         return None
     along_y = np.log(power[[row - 1, row, (row + 1) % height], column] + 1e-30)
-    left, right = abs(column - 1), min(column + 1, power.shape[1] - 1)
-    along_x = np.log(power[row, [left, column, right]] + 1e-30)
+    # Left of column 0 lie the negative frequencies, which a real image mirrors through zero.
+    left = power[row, column - 1] if column else power[-row % height, 1]
+    right = power[row, min(column + 1, power.shape[1] - 1)]
+    along_x = np.log(np.array([left, power[row, column], right]) + 1e-30)
     fy_peak = float(fy[row, 0]) + _vertex(along_y) / height
     fx_peak = float(fx[0, column]) + _vertex(along_x) / width
     # y points down in the image and up in the angle's convention.
