@@ -13,6 +13,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from workbench.errors import one_line
 from workbench.pipeline import Pipeline, Run, dependencies
 from workbench.report import RunReport
 from workbench.session import Session
@@ -49,7 +50,8 @@ class Bridge:
             try:
                 stage.log(recording, self._logged(run, stage.name))
             except Exception as error:
-                broken[stage.name] = f"its pictures: {type(error).__name__}: {error}"
+                broken[stage.name] = f"its pictures: {one_line(error)}"
+                report.fail(stage.name, broken[stage.name])
         for name, milliseconds in run.stage_ms.items():
             recording.log(f"bench/times/{name}", rr.Scalars(milliseconds))
         for name, value in scores.items():
@@ -62,7 +64,7 @@ class Bridge:
         if not self._laid_out >= shown | {"bench"}:
             # The first frame, or the first on which a stage that failed before came through.
             self._laid_out |= shown | {"bench"}
-            recording.send_blueprint(self.blueprint(run, bool(scores), broken))
+            recording.send_blueprint(self.blueprint(run, bool(scores), broken, report))
 
     def close(self, report: RunReport) -> None:
         """What is known only at the end: the recording's defects in full, and how it pairs."""
@@ -166,7 +168,7 @@ class Bridge:
     # -- the layout -------------------------------------------------------------------------------
 
     def blueprint(
-        self, run: Run, scored: bool, broken: Mapping[str, str] | None = None
+        self, run: Run, scored: bool, broken: Mapping[str, str], report: RunReport
     ) -> rrb.Blueprint:
         """One row that reads from left to right, stage after stage, and a shelf below it.
 
@@ -183,9 +185,14 @@ class Bridge:
         ]
         shares = [1.0]
         for stage in self.session.pipeline.stages:
-            if stage.name in (broken or {}):
+            if stage.name in broken:
                 continue
-            for view in stage.views(self._logged(run, stage.name)):
+            try:
+                views = list(stage.views(self._logged(run, stage.name)))
+            except Exception as error:
+                report.fail(stage.name, f"its views: {one_line(error)}")
+                continue
+            for view in views:
                 columns.append(view)
                 shares.append(1.7 if isinstance(view, rrb.Spatial3DView) else 1.0)
         shelf: list[Any] = []

@@ -5,21 +5,20 @@ Exit codes: 0 done, 1 the data or the run failed, 2 wrong usage.
 
 from __future__ import annotations
 
-import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from workbench import interrupts
 from workbench.errors import (
     EXIT_FAILED,
     EXIT_INTERRUPTED,
-    EXIT_TERMINATED,
     EXIT_USAGE,
     DataError,
-    Terminated,
     UsageError,
+    one_line,
 )
 
 app = typer.Typer(
@@ -246,28 +245,24 @@ def calibrate(
     )
 
 
-def _terminate(_signum: int, _frame: Any) -> None:
-    raise Terminated
-
-
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
-    signal.signal(signal.SIGTERM, _terminate)
+    interrupts.install()
     try:
         code = app(standalone_mode=False) or 0
-    except typer.Abort as error:
-        terminated = isinstance(error.__cause__, Terminated)
-        code = EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+    except (KeyboardInterrupt, typer.Abort):
+        code = EXIT_INTERRUPTED
     except UsageError as error:
-        print(f"workbench: {error}", file=sys.stderr)
+        print(f"workbench: {one_line(error)}", file=sys.stderr)
         code = EXIT_USAGE
     except (DataError, OSError) as error:
-        print(f"workbench: {error}", file=sys.stderr)
+        print(f"workbench: {one_line(error)}", file=sys.stderr)
         code = EXIT_FAILED
     except Exception as error:
         # A wrong flag.  Typer carries its own click, whose base class it does not export.
-        if not hasattr(error, "show"):
+        if not hasattr(error, "format_message"):
             raise
-        error.show()
+        print(f"workbench: {' '.join(error.format_message().split())}", file=sys.stderr)
         code = EXIT_USAGE
-    sys.exit(code)
+    # Typer itself takes every interruption for Ctrl-C.
+    sys.exit(interrupts.exit_code() if code == EXIT_INTERRUPTED else code)

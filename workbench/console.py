@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
+import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -20,12 +22,17 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from workbench import interrupts
+from workbench.errors import EXIT_FAILED, DataError
 from workbench.report import RunReport
 from workbench.stage import Score
 
 T = TypeVar("T")
 
-out = Console(highlight=False)
+_PIPED_WIDTH = 200
+"""Columns where the output is no terminal: enough that no name is broken for a search."""
+
+out = Console(highlight=False, width=None if sys.stdout.isatty() else _PIPED_WIDTH)
 err = Console(stderr=True, highlight=False)
 
 
@@ -108,3 +115,19 @@ def closing_tables(report: RunReport) -> None:
         out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)
     for (stage, says), count in report.failures.items():
         out.print(f"FAILED, {count} frames: {stage}: {says}", style="bold red", markup=False)
+
+
+@contextmanager
+def interruptible(report: RunReport) -> Iterator[None]:
+    """Let Ctrl-C or SIGTERM end a run early, so that what follows keeps and tells what was done."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        report.interrupted = interrupts.exit_code()
+
+
+def end(report: RunReport) -> NoReturn:
+    """Leave the command with the exit code that the run deserves."""
+    if report.frames == 0 and not report.interrupted:
+        raise DataError(f"{report.session.recording.path}: no frame in it, or in --frames")
+    raise typer.Exit(report.interrupted or (EXIT_FAILED if report.failed else 0))

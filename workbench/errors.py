@@ -17,5 +17,9 @@ class UsageError(Exception):
     """The command was called wrongly: exit code 2."""
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM came: everything is closed as for Ctrl-C, so that what is written stays readable."""
+def one_line(error: BaseException) -> str:
+    """What an exception says, on one line, with its type unless it is one of ours."""
+    text = " ".join(str(error).split())
+    if isinstance(error, DataError | UsageError):
+        return text
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

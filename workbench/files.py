@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from workbench.errors import DataError
+
 
 @contextmanager
 def replacing(path: Path, keep_partial: bool = False) -> Iterator[Path]:
@@ -25,3 +27,11 @@ def replacing(path: Path, keep_partial: bool = False) -> Iterator[Path]:
             beside.replace(path)
         else:
             beside.unlink(missing_ok=True)
+
+
+def check_output(flag: str, path: Path) -> None:
+    """Raise :class:`DataError` unless a file can be put at ``path``, before any work is done."""
+    if path.is_dir():
+        raise DataError(f"{flag} {path}: expected a file, found a folder")
+    if not path.absolute().parent.is_dir():
+        raise DataError(f"{flag} {path}: there is no folder {path.parent}")

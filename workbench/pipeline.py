@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from workbench.digest import digest_of, digest_of_code, digest_of_file
+from workbench.errors import one_line
 from workbench.settings import Settings
 from workbench.stage import (
     WARNINGS,
@@ -156,10 +157,10 @@ class Pipeline:
         for stage in self.stages:
             lacking = [n.name for n in stage.needs if n.required and n.name not in artifacts]
             if lacking:
-                failures.append(_lacking(stage, lacking, failed_givers))
-                failed_givers.update(
-                    (a.name, failed_givers.get(lacking[0], stage.name)) for a in stage.gives
-                )
+                failure = _lacking(stage, lacking, failed_givers)
+                failures.append(failure)
+                culprit = failure.blocked_by or stage.name
+                failed_givers.update((a.name, culprit) for a in stage.gives)
                 continue
             parameters = self.settings.parameters[stage.name]
             key = digest_of(
@@ -172,7 +173,7 @@ class Pipeline:
                 try:
                     result = self._compute(stage, inputs, parameters)
                 except Exception as error:
-                    failures.append(Failure(stage.name, _one_line(error)))
+                    failures.append(Failure(stage.name, one_line(error)))
                     failed_givers.update((a.name, stage.name) for a in stage.gives)
                     continue
                 self.store.put(key, result)
@@ -210,13 +211,14 @@ class Pipeline:
             digests[name] = digest
 
     def _compute(self, stage: Stage, inputs: Mapping[str, Any], parameters: Any) -> _Result:
-        if stage.name not in self._warm:
-            # The first call of a stage pays for imports and compilation, which would be told as
-            # its time on the first frame; the timed call is the second.
-            stage.compute(inputs, parameters)
-            self._warm.add(stage.name)
         with python_warnings.catch_warnings(record=True) as caught:
             python_warnings.simplefilter("always")
+            if stage.name not in self._warm:
+                # The first call of a stage pays for imports and compilation, which would be
+                # told as its time on the first frame; the timed call is the second.
+                stage.compute(inputs, parameters)
+                self._warm.add(stage.name)
+                caught.clear()
             start = time.perf_counter()
             outputs = dict(stage.compute(inputs, parameters))
             milliseconds = (time.perf_counter() - start) * 1e3
@@ -308,8 +310,3 @@ def _lacking(stage: Stage, lacking: Sequence[str], failed: Mapping[str, str]) ->
     if culprit is not None:
         return Failure(stage.name, f"not run: {culprit} failed", blocked_by=culprit)
     return Failure(stage.name, f"not run: the recording has no {', '.join(lacking)}")
-
-
-def _one_line(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if isinstance(error, StageError) else f"{type(error).__name__}: {text}"

@@ -9,7 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 
-from workbench.stage import Stage, StageError
+from workbench.digest import digest_of_file
+from workbench.errors import one_line
+from workbench.stage import Artifact, Stage, StageError
 
 GROUP = "workbench.stages"
 
@@ -24,9 +26,9 @@ def find_stages(files: Sequence[Path] = ()) -> dict[str, Stage]:
     for entry in sorted(importlib.metadata.entry_points(group=GROUP), key=lambda e: e.name):
         try:
             found = entry.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise StageError(
-                f"plugin {entry.name} ({entry.value}) cannot be loaded: {error}"
+                f"plugin {entry.name} ({entry.value}) cannot be loaded: {one_line(error)}"
             ) from error
         _add(stages, [found], f"plugin {entry.name} ({entry.value})")
     for path in files:
@@ -51,13 +53,23 @@ def _add(stages: dict[str, Stage], classes: Iterable[type], origin: str) -> None
             raise StageError(f"{origin}: expected a class derived from workbench.Stage, got {cls}")
         if not getattr(cls, "name", ""):
             raise StageError(f"{origin}: {cls.__name__} has no name")
-        stages[cls.name] = cls()
+        for declared in (*cls.needs, *cls.gives):
+            if not isinstance(declared, Artifact):
+                raise StageError(
+                    f"{origin}: {cls.__name__} needs and gives Artifacts, got {declared!r}"
+                )
+        try:
+            stages[cls.name] = cls()
+        except Exception as error:
+            raise StageError(f"{origin}: {cls.__name__}: {one_line(error)}") from error
 
 
 def _load_file(path: Path) -> ModuleType:
     if not path.is_file():
         raise StageError(f"--plugin {path}: no such file")
-    name = f"workbench_plugin_{path.stem}"
+    # Its own name for each content: an edited file, or another of the same name, is another
+    # module, with another code digest.
+    name = f"workbench_plugin_{path.stem}_{digest_of_file(path)[:12]}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise StageError(f"--plugin {path}: expected a Python file")
@@ -65,7 +77,7 @@ def _load_file(path: Path) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         del sys.modules[name]
-        raise StageError(f"--plugin {path}: {type(error).__name__}: {error}") from error
+        raise StageError(f"--plugin {path}: {one_line(error)}") from error
     return module

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from workbench.errors import one_line
 from workbench.files import replacing
 from workbench.pipeline import Run
 from workbench.session import Session
@@ -30,7 +31,8 @@ class RunReport:
     worst_ms: dict[str, float] = field(default_factory=dict)
     failures: Counter[tuple[str, str]] = field(default_factory=Counter)
     warnings: Counter[str] = field(default_factory=Counter)
-    interrupted: bool = False
+    interrupted: int = 0
+    """The exit code of Ctrl-C or SIGTERM if the run was ended by one, else 0."""
     scorers: dict[str, Scorer] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -54,14 +56,22 @@ class RunReport:
         for says in run.warnings:
             self._count(self.warnings, says)
         scores: dict[str, float] = {}
+        failed = {failure.stage for failure in run.failures}
         if run.frame.truth is not None:
             for name, scorer in self.scorers.items():
+                if name in failed:
+                    continue
                 try:
                     own = scorer.add(run.frame.truth, run.artifacts)
-                except KeyError:
-                    continue  # The stage failed on this frame, and that is told already.
+                except Exception as error:
+                    self.fail(name, f"scoring: {one_line(error)}")
+                    continue
                 scores.update({f"{name}/{key}": value for key, value in own.items()})
         return scores
+
+    def fail(self, stage: str, says: str) -> None:
+        """Count a failure of a stage outside its computation."""
+        self._count(self.failures, (stage, says))
 
     @staticmethod
     def _count(counter: Counter[Any], key: Any) -> None:
@@ -70,7 +80,12 @@ class RunReport:
 
     def scores(self) -> dict[str, list[Score]]:
         """The figures of every stage that can be scored and had truth to be scored against."""
-        found = {name: scorer.summary() for name, scorer in self.scorers.items()}
+        found = {}
+        for name, scorer in self.scorers.items():
+            try:
+                found[name] = scorer.summary()
+            except Exception as error:
+                self.failures[(name, f"scoring: {one_line(error)}")] = 1
         return {name: scores for name, scores in found.items() if scores}
 
     def median_ms(self, stage: str) -> float:
@@ -86,7 +101,7 @@ class RunReport:
         return {
             "recording": self.session.recording.path.name,
             "frames": self.frames,
-            "interrupted": self.interrupted,
+            "interrupted": bool(self.interrupted),
             "defects": self.session.recording.defects.as_dict(),
             "stages": {
                 name: {"median_ms": self.median_ms(name), "worst_ms": self.worst_ms[name]}

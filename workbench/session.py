@@ -10,7 +10,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from workbench.errors import UsageError
+from workbench import interrupts
+from workbench.errors import DataError, UsageError
 from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.plugins import find_stages
 from workbench.recording import Recording
@@ -56,9 +57,11 @@ class Session:
         check_stage(options.until, stages, "--until")
         check_topics(options.topics, stages)
         settings = resolve(stages, options.preset, options.config, options.assignments)
+        check_resources(options.resources, stages)
         resources = resources_beside(options.recording, stages) | dict(options.resources)
         pipeline = Pipeline(stages, settings, resources, options.until, store)
         recording.require(pipeline.channels[0])
+        recording.check_overrides()
         return Session(options, recording, pipeline)
 
     def count(self) -> int:
@@ -72,7 +75,9 @@ class Session:
         required, optional = self.pipeline.channels
         start, stop = self.options.frames
         for frame in self.recording.frames(required, optional, start, stop):
-            yield self.pipeline.run(frame)
+            run = self.pipeline.run(frame)
+            interrupts.check()
+            yield run
 
     def provenance(self) -> dict[str, Any]:
         """What identifies a result: code, parameters, input and what it ran on."""
@@ -117,6 +122,18 @@ def check_stage(name: str | None, stages: Mapping[str, Stage], flag: str) -> Non
     """Raise :class:`UsageError` unless ``name`` is None or a stage."""
     if name is not None and name not in stages:
         raise UsageError(f"{flag} {name}: no such stage; stages: {', '.join(stages)}")
+
+
+def check_resources(resources: Mapping[str, Path], stages: Mapping[str, Stage]) -> None:
+    """Raise unless every named file exists and some stage takes it."""
+    taken = {
+        need.name for stage in stages.values() for need in stage.needs if isinstance(need, Resource)
+    }
+    for name, path in resources.items():
+        if not path.is_file():
+            raise DataError(f"--{name} {path}: no such file")
+        if name not in taken:
+            raise UsageError(f"--{name} {path}: no stage takes {name}")
 
 
 def check_topics(topics: Mapping[str, str], stages: Mapping[str, Stage]) -> None:

@@ -18,6 +18,7 @@ from workbench.errors import UsageError
 from workbench.stage import Stage, StageParameters
 
 DEFAULT_PRESET = "default"
+_CONFIG_KEYS = ("preset", "parameters", "reason", "provenance")
 
 
 class SettingsError(UsageError):
@@ -58,6 +59,11 @@ def resolve(
     from_file: dict[str, Any] = {}
     if config is not None:
         from_file = _read_toml(config)
+        for key in from_file:
+            if key not in _CONFIG_KEYS:
+                raise SettingsError(
+                    f"--config {config}: unknown key {key!r}; expected {', '.join(_CONFIG_KEYS)}"
+                )
     preset = preset or str(from_file.get("preset", DEFAULT_PRESET))
     if preset not in preset_names(stages.values()):
         raise SettingsError(

@@ -145,7 +145,7 @@ class StageParameters(BaseModel):
     The declaration is the flag, the slider, the sweep axis and the reference page.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     @classmethod
     def knobs(cls) -> dict[str, Knob]:

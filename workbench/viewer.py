@@ -199,7 +199,7 @@ def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
             str(rrd),
         ],
         stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
     )
     try:
         _await_port(port, child)

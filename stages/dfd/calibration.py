@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -107,37 +108,57 @@ class Calibration:
     def load(path: Path) -> Calibration:
         """Read a file that :meth:`save` wrote.  Raises ``OSError``, or ``ValueError`` in a line."""
         try:
-            with np.load(path, allow_pickle=False) as file:
-                if "format" not in file or str(file["format"]) != FORMAT:
-                    raise ValueError(f"expected a {FORMAT} file, found arrays {file.files[:4]}")
-                version = int(file["version"])
-                if version != VERSION:
-                    raise ValueError(
-                        f"expected calibration version {VERSION}, found {version}; "
-                        "run `workbench calibrate` again"
-                    )
-                width, height = (int(v) for v in file["size"])
-                curve = file["curve"]
-                if curve.ndim != 3 or curve.shape[1:] != (height, width):
-                    raise ValueError(
-                        f"expected a curve for {width}×{height} pixels, found {curve.shape}"
-                    )
-                kind = str(file["laplacian"])
-                if kind not in ("opencv", "paper"):
-                    raise ValueError(f"expected laplacian opencv or paper, found {kind!r}")
-                scale, rotation, dx, dy = (float(v) for v in file["similarity"])
-                near_z_m, far_z_m = (float(v) for v in file["range_m"])
-                return Calibration(
-                    Similarity(scale, rotation, dx, dy, width, height),
-                    Stripes(*(float(v) for v in file["stripes"])),
-                    kind,  # type: ignore[arg-type]
-                    curve,
-                    near_z_m,
-                    far_z_m,
-                    file["modulation"],
-                    SensorNoise(*(float(v) for v in file["noise"])),
-                    file["gain"],
-                    json.loads(str(file["report"])),
-                )
-        except (zipfile.BadZipFile, KeyError, EOFError) as error:
+            with path.open("rb") as raw:
+                file = np.load(raw, allow_pickle=False)
+                return _from_arrays({name: file[name] for name in file.files})
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            EOFError,
+            AttributeError,
+            KeyError,
+            TypeError,
+        ) as error:
             raise ValueError(f"expected a {FORMAT} file: damaged or not one ({error})") from error
+
+
+def _from_arrays(arrays: dict[str, np.ndarray]) -> Calibration:
+    """The calibration that a file's arrays hold.  Raises ``ValueError``, ``KeyError`` or so."""
+    if str(arrays.get("format")) != FORMAT:
+        raise ValueError(f"expected a {FORMAT} file, found arrays {', '.join(list(arrays)[:4])}")
+    version = str(arrays["version"])
+    if version != str(VERSION):
+        raise ValueError(
+            f"expected calibration version {VERSION}, found {version}; "
+            "run `workbench calibrate` again"
+        )
+    width, height = (int(v) for v in _numbers(arrays, "size", 2))
+    curve = arrays["curve"]
+    if curve.ndim != 3 or curve.shape[1:] != (height, width) or not np.isfinite(curve).all():
+        raise ValueError(f"expected a curve for {width}×{height} pixels, found {curve.shape}")
+    kind = str(arrays["laplacian"])
+    if kind not in ("opencv", "paper"):
+        raise ValueError(f"expected laplacian opencv or paper, found {kind!r}")
+    scale, rotation_deg, dx_px, dy_px = _numbers(arrays, "similarity", 4)
+    near_z_m, far_z_m = _numbers(arrays, "range_m", 2)
+    if not 0 < near_z_m < far_z_m:
+        raise ValueError(f"expected a working range in metres, found {near_z_m} to {far_z_m}")
+    return Calibration(
+        Similarity(scale, rotation_deg, dx_px, dy_px, width, height),
+        Stripes(*_numbers(arrays, "stripes", 3)),
+        kind,  # type: ignore[arg-type]
+        curve.astype(np.float32, copy=False),
+        near_z_m,
+        far_z_m,
+        arrays["modulation"].astype(np.float32, copy=False),
+        SensorNoise(*_numbers(arrays, "noise", 2)),
+        np.array(_numbers(arrays, "gain", 6)),
+        json.loads(str(arrays["report"])),
+    )
+
+
+def _numbers(arrays: dict[str, np.ndarray], name: str, count: int) -> list[float]:
+    values = arrays[name]
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f"expected {count} numbers for {name}, found {values.tolist()}")
+    return [float(v) for v in values]

@@ -11,6 +11,7 @@ import pydantic
 
 from workbench.console import err, out, table
 from workbench.errors import DataError, UsageError
+from workbench.files import check_output
 from workbench.plugins import find_stages
 from workbench.recording import Recording
 from workbench.report import to_json
@@ -34,8 +35,7 @@ def run(
     check_topics(topics, stages)
     procedure = _procedure(stages)
     parameters = _parameters(procedure.Parameters, assignments)
-    if not output.parent.is_dir():
-        raise UsageError(f"--output {output}: no such folder")
+    check_output("--output", output)
     recording = Recording.open(path, topics=topics)
     required = [
         need.channel

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import typer
-
-from workbench.console import closing_tables, tracked
-from workbench.errors import EXIT_FAILED, DataError
+from workbench.console import closing_tables, end, interruptible, tracked
+from workbench.errors import DataError
 from workbench.report import RunReport, to_json
 from workbench.session import Options, Session
 
@@ -14,18 +12,17 @@ def run(options: Options, as_json: bool) -> None:
     """Evaluate; exits with 1 if there is nothing to evaluate or a stage failed."""
     session = Session.open(options)
     report = RunReport(session)
-    for result in tracked(session.runs(), "evaluate", session.count()):
-        report.add(result)
+    with interruptible(report):
+        for result in tracked(session.runs(), "evaluate", session.count()):
+            report.add(result)
     if as_json:
         print(to_json(report.as_dict()))
     else:
         closing_tables(report)
-    if report.frames == 0:
-        raise DataError(f"{options.recording}: no frame to evaluate")
-    if not report.scores():
+    if report.frames and not report.scores():
         lacking = [] if "calibration" in session.pipeline.resources else ["no calibration given"]
         raise DataError(
             f"{options.recording}: nothing could be scored: "
             + "; ".join([*lacking, "expected /ground_truth topics that the stages can be held to"])
         )
-    raise typer.Exit(EXIT_FAILED if report.failed else 0)
+    end(report)

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import typer
 
-from workbench.console import closing_tables, out, tracked
-from workbench.errors import EXIT_FAILED, DataError, UsageError
+from workbench.console import closing_tables, end, interruptible, out, tracked
+from workbench.errors import DataError, UsageError
 from workbench.files import replacing
 from workbench.pipeline import Run
 from workbench.report import RunReport, to_json, write_beside
@@ -26,23 +25,22 @@ def run(options: Options, folder: Path, artifacts: str | None, as_json: bool) ->
     except OSError as error:
         raise DataError(f"--to {folder}: {error.strerror}") from error
     report = RunReport(session)
+    write_beside(folder / "provenance.json", to_json(session.provenance()) + "\n")
     with (
         replacing(folder / "results.jsonl", keep_partial=True) as beside,
         beside.open("w", encoding="utf-8") as lines,
+        interruptible(report),
     ):
         for result in tracked(session.runs(), "export", session.count()):
             report.add(result)
             _write_arrays(folder / f"frame_{result.frame.index:06d}.npz", result, wanted)
             lines.write(json.dumps(result_line(result), sort_keys=True) + "\n")
-    write_beside(folder / "provenance.json", to_json(session.provenance()) + "\n")
     if as_json:
         print(to_json(report.as_dict() | {"to": str(folder), "artifacts": wanted}))
     else:
         closing_tables(report)
         out.print(f"wrote {report.frames} frames to {folder}", soft_wrap=True, markup=False)
-    if report.frames == 0:
-        raise DataError(f"{options.recording}: no frame to export")
-    raise typer.Exit(EXIT_FAILED if report.failed else 0)
+    end(report)
 
 
 def result_line(run: Run) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from workbench.report import finite, to_json
 def run(path: Path, topics: Mapping[str, str], as_json: bool) -> None:
     """Read the whole recording, decode every image, and tell what was found."""
     recording = Recording.open(path, topics=topics)
+    recording.check_overrides()
     defects = recording.scan()
     found = recording.topics()
     if as_json:

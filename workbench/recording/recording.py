@@ -207,6 +207,16 @@ class Recording:
         self._passes = (scanning,)
         return self.defects
 
+    def check_overrides(self) -> None:
+        """Raise :class:`RecordingError` if a topic that a channel was mapped to is not there."""
+        images = self._image_topics()
+        for channel, topic in self._overrides.items():
+            if topic not in images:
+                raise RecordingError(
+                    f"{self.path}: expected images on {topic} (--topic {channel}={topic}); "
+                    f"image topics found: {', '.join(sorted(images)) or 'none'}"
+                )
+
     # -- how --------------------------------------------------------------------------------------
 
     def _pass(
