@@ -50,6 +50,7 @@ class DepthCloud(Stage):
     """
 
     name = "depth_cloud"
+    chapter = "sensor"
     needs = (
         FOCUS_NEAR,
         FOCUS_FAR,
@@ -96,6 +97,14 @@ class DepthCloud(Stage):
         min_confidence: float = knob(
             0.5,
             "Depth of less confidence than this is given as unknown.",
+            low=0,
+            high=1,
+            step=0.01,
+        )
+        min_modulation: float = knob(
+            0.86,
+            "Share of the calibrated contrast of the stripes that a neighbourhood must show: "
+            "with less, it lies beyond the focal planes, where depth is not unique.",
             low=0,
             high=1,
             step=0.01,
@@ -163,6 +172,17 @@ class DepthCloud(Stage):
             | (relative > 1 + margin)
         )
         relative[unknown] = np.nan
+        if calibration is not None:
+            folded = dfd.folded_back(
+                inputs["focus_near"] + inputs["focus_far"],
+                brightness,
+                relative,
+                calibration.modulation,
+                period_px,
+                parameters.min_modulation,
+            )
+            relative[folded] = np.nan
+            confidence[folded] = 0
         warnings: list[str] = []
         if calibration is None:
             warnings.append(RELATIVE_NOTE)

@@ -24,6 +24,7 @@ class FocusMaps(Stage):
     """
 
     name = "focus_maps"
+    chapter = "sensor"
     needs = (NEAR, FAR, STRIPES, CALIBRATION)
     gives = (FOCUS_NEAR, FOCUS_FAR)
 

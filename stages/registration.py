@@ -42,6 +42,7 @@ class Registration(Stage):
     """
 
     name = "registration"
+    chapter = "sensor"
     needs = (NEAR_IMAGE, FAR_IMAGE, FLAT_IMAGE, CALIBRATION)
     gives = (NEAR, FAR, INTENSITY, SATURATED, STRIPES, DRIFT, GAIN_DRIFT)
 

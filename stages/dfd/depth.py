@@ -8,17 +8,25 @@ linear in t over the image, whatever its tilt.
 
 **Windows that stop at depth edges.**  A window across a depth edge mixes two surfaces, and the
 blur itself mixes them over a few pixels more.  So each pixel hears, besides its own window,
-eight neighbours about one stripe period away.  Each speaks for the pixel by extrapolating its
-own local plane, and is heard by a weight that falls steeply with
+four neighbours about one stripe period away along the diagonals.  Each speaks for the pixel by
+extrapolating its own local plane, and is heard by a weight that falls steeply with
 
 * how much its surroundings depart from a plane (a window on an edge does),
 * how far the local modulation is from what the calibration has at that depth (mixed pixels,
   shadow rims and defocus beyond the working range are),
 * the predicted noise, the difference in brightness to the pixel, and the distance.
 
-Inside a face all nine agree; at an edge the ones that look inward from the pixel's own side win.
+Inside a face all five agree; at an edge the ones that look inward from the pixel's own side win.
 The same terms, which are all in percent of the working range, make the predicted error, and from
 it the confidence.
+
+**How it is made fast.**  A focus map is itself a mean over one stripe period, so its neighbouring
+pixels say nearly the same; every window here therefore takes three samples along each axis,
+0.4 to 0.6 periods apart, in place of all pixels.  The image streams through one compiled loop
+over rows: each row of windows, of costs and of results is made as soon as the rows it needs are
+there, and only a few rows of each are kept, so that an image of any size is worked on in the
+processor's cache.  Within a row everything is a plain loop over contiguous float32 without
+branches, which LLVM turns into SIMD.
 """
 
 from __future__ import annotations
@@ -29,58 +37,86 @@ import cv2
 import numba
 import numpy as np
 
-from stages.dfd.focus import LaplacianKind, SensorNoise, noise_gain
+from stages.dfd.focus import LaplacianKind, SensorNoise, mirror_ends, mirrored, noise_gain
 
 NOMINAL_CURVE = np.array([0.5, -0.5], np.float32).reshape(2, 1, 1)
 """Relative depth from Q where there is no calibration: t = (1 - Q) / 2."""
 
-_BAND_ROWS = 128
-_SAFE = np.float32(1e-6)
-
 # What the terms of the predicted error weigh.  They are dimensionless, and were chosen once on
 # ray-traced piles so that the predicted error ranks the true one; nothing depends on a rig.
-_SCATTER_WEIGHT = 0.5
-_MODULATION_WEIGHT = 8.0
-_NOISE_WEIGHT = 1.0
-_MOVED_WEIGHT = 0.5
-_DISTANCE_WEIGHT = 0.5
-_CONTRAST_WEIGHT = 0.01
-_RELATIVE_CONTRAST = 0.02
-_COST_FLOOR = 0.1
-_EDGE_WEIGHT = 8.0
+_SCATTER_WEIGHT = np.float32(0.5**2)
+_MODULATION_WEIGHT = np.float32(8.0)
+_MOVED_WEIGHT = np.float32((100 * 0.5) ** 2)
+_EDGE_WEIGHT = np.float32(2.0)
+_DISTANCE_COST = np.float32(0.56)
+_CONTRAST_WEIGHT = np.float32(0.005)
+_RELATIVE_CONTRAST = np.float32(0.02**2)
+_COST_FLOOR = np.float32(0.1)
+_ERROR_SCALE = np.float32(0.79)
+_OBLIQUE_REACH = 0.85
+
+_ZERO = np.float32(0)
+_ONE = np.float32(1)
+_TWO = np.float32(2)
+_HALF = np.float32(0.5)
+_QUARTER = np.float32(0.25)
+_INFINITE = np.float32(np.inf)
+_TINY = np.float32(1e-12)
+_SAFE = np.float32(1e-6)
+_PERCENT = np.float32(100 * 100)
+_ODDEST = np.float32(0.28)
+"""Relative difference of squared modulations, a factor of 4/3 between the amounts, beyond which
+no surface within the working range shows so little contrast, or so much: beyond the focal planes
+the ratio folds back to where it was, but there both images are blurred."""
+_FOLD_CELL_PERIODS = 0.8
+_FOLD_CELLS = (5, 5)
+_HIGHEST_COST = np.float32(1e9)
+"""Of the windows outside the image, and of those that know nothing: its fourth power is finite."""
+_INVERSE_FOURTH_POWER = np.int32(5 * 127 * (1 << 23) - (1 << 32))
 
 
 @dataclass(frozen=True)
 class Windows:
-    """The window sides in pixels, all derived from the stripe period (see :func:`windows_for`)."""
+    """Distances between the samples of a window, in pixels, all derived from the stripe period.
+
+    ``x_taps`` and ``y_taps``: the second averaging of the energies, weights 1/4, 1/2, 1/4 at
+    -``smoothing_px``, 0 and ``smoothing_px``.  See :func:`windows_for`.
+    """
 
     x_taps: np.ndarray
     y_taps: np.ndarray
+    smoothing_px: int
     scatter_px: int
     slope_px: int
+    """Slopes, scatter and contrast are told from samples at -``slope_px``, 0, ``slope_px``."""
     reach_px: int
+    """The neighbours that are heard lie at (±``reach_px``, ±``reach_px``)."""
     samples: float
     """Independent samples of the Laplacian in one window, for the predicted noise."""
 
     @property
     def halo_px(self) -> int:
         """How far away a pixel's result may depend on the focus maps."""
-        own = len(self.x_taps) // 2 + self.slope_px + self.scatter_px // 2
-        return own + self.reach_px
+        return self.smoothing_px + self.slope_px + self.reach_px
 
 
 def windows_for(period_px: float, smoothing_periods: float, reach_periods: float) -> Windows:
     """Windows scaled to the stripe period (or, without stripes, to the focus window)."""
-    side = max(1, int(period_px * smoothing_periods) | 1)
-    taps = np.full(side, 1 / side, np.float32)
+    # The three samples of the second averaging have the variance of a box of this side.
+    side = period_px * smoothing_periods
+    smoothing = round(side / 6**0.5)
+    taps = np.zeros(2 * smoothing + 1, np.float32)
+    for at, weight in ((0, 0.25), (smoothing, 0.5), (2 * smoothing, 0.25)):
+        taps[at] += np.float32(weight)
     # The Laplacian's response is correlated over about two pixels each way.
     samples = max(1.0, (period_px * max(1.0, smoothing_periods)) ** 2 / 4)
     return Windows(
         taps,
         taps,
+        smoothing_px=smoothing,
         scatter_px=max(3, int(1.4 * period_px) | 1),
         slope_px=max(1, round(0.6 * period_px)),
-        reach_px=max(1, round(reach_periods * period_px)),
+        reach_px=max(1, round(_OBLIQUE_REACH * reach_periods * period_px)),
         samples=samples,
     )
 
@@ -114,298 +150,445 @@ def estimate(
     ``focus_near`` and ``focus_far`` are focus maps over one stripe period, ``brightness`` is the
     sum of near and far over the same window, ``guide`` an image without stripes whose contrasts
     tell surfaces apart; all float32 [H W].  Where there is no energy at all the error is
-    infinite and the relative depth is 0.5.
-
-    The image is worked through in bands of rows with a halo, so that a large one stays in the
-    processor's cache; the result does not depend on the bands.
+    infinite and the relative depth is 0.5.  A pixel's result depends on nothing further away
+    than ``windows.halo_px``.
     """
-    height, width = focus_near.shape
-    depth = np.empty((height, width), np.float32)
-    error = np.empty((height, width), np.float32)
-    halo = windows.halo_px
-    rows = max(_BAND_ROWS, (1 << 15) // width)
-    for top in range(0, height, rows):
-        bottom = min(top + rows, height)
-        first, last = max(0, top - halo), min(height, bottom + halo)
-        band = slice(first, last)
-        curve = response.curve if response.curve.shape[1] == 1 else response.curve[:, band]
-        band_depth, band_error = _estimate_band(
-            focus_near[band],
-            focus_far[band],
-            brightness[band],
-            guide[band],
-            curve,
-            response,
-            windows,
-            edge_aware,
-        )
-        inner = slice(top - first, bottom - first)
-        depth[top:bottom] = band_depth[inner]
-        error[top:bottom] = band_error[inner]
-    return depth, error
-
-
-def _estimate_band(
-    focus_near: np.ndarray,
-    focus_far: np.ndarray,
-    brightness: np.ndarray,
-    guide: np.ndarray,
-    curve: np.ndarray,
-    response: Response,
-    windows: Windows,
-    edge_aware: bool,
-) -> tuple[np.ndarray, np.ndarray]:
-    def smooth(image: np.ndarray) -> np.ndarray:
-        return cv2.sepFilter2D(
-            image,
-            cv2.CV_32F,
-            windows.x_taps,
-            windows.y_taps,
-            borderType=cv2.BORDER_REFLECT_101,
-        )
-
-    light = smooth(brightness)
+    width = focus_near.shape[1]
+    curve = response.curve
+    if curve.shape[1:] == (1, 1):
+        curve = np.repeat(curve, width, axis=2)
+    # The loops over powers expect two coefficients or more.
+    modulation = np.zeros(1) if response.modulation is None else response.modulation
+    if len(modulation) < 2:
+        modulation = np.append(modulation, 0)
     variance = noise_gain(response.kind) / windows.samples
-    modulation = response.modulation
-    fine, coarse, trouble = _ratios_to_depths(
-        focus_near,
-        focus_far,
-        smooth(focus_near * focus_near),
-        smooth(focus_far * focus_far),
-        light,
-        np.ascontiguousarray(curve),
-        np.zeros(0, np.float32) if modulation is None else modulation.astype(np.float32),
+    return _estimate(
+        np.ascontiguousarray(focus_near),
+        np.ascontiguousarray(focus_far),
+        np.ascontiguousarray(brightness),
+        np.ascontiguousarray(guide),
+        # As tuples, highest power first: their lengths are then part of the compiled type, the
+        # loops over powers are unrolled, and the loops over pixels around them become SIMD.
+        tuple(np.ascontiguousarray(c, np.float32) for c in curve[::-1]),
+        tuple(np.float32(c) for c in modulation[::-1]),
+        _ZERO if response.modulation is None else _MODULATION_WEIGHT,
         np.float32(variance * response.noise.read_variance),
-        np.float32(variance * response.noise.gain),
-        np.float32(response.slope * 100 * _NOISE_WEIGHT),
-        np.float32(_MODULATION_WEIGHT),
-    )
-    side = (windows.scatter_px, windows.scatter_px)
-    mean = cv2.blur(fine, side, borderType=cv2.BORDER_REFLECT_101)
-    square = cv2.sqrBoxFilter(
-        fine, cv2.CV_32F, side, normalize=True, borderType=cv2.BORDER_REFLECT_101
-    )
-    slope_x, slope_y = _slopes(coarse, windows.slope_px)
-    guide_mean = cv2.blur(guide, side, borderType=cv2.BORDER_REFLECT_101)
-    guide_square = cv2.sqrBoxFilter(
-        guide, cv2.CV_32F, side, normalize=True, borderType=cv2.BORDER_REFLECT_101
-    )
-    cost, scatter = _window_costs(
-        mean, square, slope_x, slope_y, trouble, guide_mean, guide_square, windows.scatter_px
-    )
-    if not edge_aware:
-        return coarse, np.sqrt(_SCATTER_WEIGHT**2 * scatter + cost)
-    return _hear_neighbours(
-        coarse,
-        slope_x,
-        slope_y,
-        cost,
-        scatter,
-        trouble,
-        guide,
-        _neighbours(windows.reach_px),
+        # The noise of near and far together, from their common brightness: half of the sum.
+        np.float32(variance * response.noise.gain / 2),
+        np.float32(2 * (100 * response.slope) ** 2),
         np.float32(response.noise.read_variance),
         np.float32(response.noise.gain),
+        windows.smoothing_px,
+        windows.slope_px,
+        windows.reach_px,
+        edge_aware,
     )
 
 
-def _neighbours(reach_px: int) -> np.ndarray:
-    """The pixel itself and eight neighbours (dx, dy) at about ``reach_px``, int64 [9 2]."""
-    near = round(0.75 * reach_px)
-    straight = [(reach_px, 0), (-reach_px, 0), (0, reach_px), (0, -reach_px)]
-    oblique = [(near, near), (near, -near), (-near, near), (-near, -near)]
-    return np.array([(0, 0), *straight, *oblique])
+# The row loops below index with unsigned integers throughout: a negative index would count from
+# the end, and the choice between the two would keep LLVM from making SIMD of the loops.
+_rows = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+"""Multiply-adds may be contracted; nothing else of the arithmetic is relaxed."""
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _ratios_to_depths(  # type: ignore[no-untyped-def]
-    near,
-    far,
+@_rows
+def _energies_row(  # type: ignore[no-untyped-def]
+    near_energy, far_energy, start, focus_near, focus_far, above, y, below
+):
+    """The second averaging down the columns: means of the squared focus maps."""
+    for x in range(np.uintp(focus_near.shape[1])):
+        a, b, c = focus_near[above, x], focus_near[y, x], focus_near[below, x]
+        near_energy[x + start] = _QUARTER * (a * a + c * c) + _HALF * b * b
+        a, b, c = focus_far[above, x], focus_far[y, x], focus_far[below, x]
+        far_energy[x + start] = _QUARTER * (a * a + c * c) + _HALF * b * b
+
+
+@_rows
+def _depth_row(  # type: ignore[no-untyped-def]
+    fine,
+    coarse,
+    trouble,
+    at,
+    start,
     near_energy,
     far_energy,
-    light,
+    smoothing,
+    focus_near,
+    focus_far,
+    brightness,
+    y,
     curve,
+    curve_y,
     modulation,
+    modulation_weight,
     read_variance,
     gain,
     noise_weight,
-    modulation_weight,
 ):
     """Relative depth over one window (fine) and over the smoothed one (coarse), and its troubles.
 
-    ``trouble`` is what noise and odd modulation add to the squared predicted error, percent².
+    With the mean energies N and F, and S² = (√N + √F)² = N + F + 2√(NF), the smoothed ratio is
+    Q = (N - F) / S².  ``trouble`` is what noise and odd modulation add to the squared predicted
+    error, percent².  With v the variance of the noise in one window, the root of an energy E has
+    the variance v (1 + v / 2E), which gives Q one of about 2 (v/S²) (1 + Q² + 2 v/S²).
     """
-    height, width = near.shape
-    terms = curve.shape[0]
-    local = curve.shape[1] > 1
-    fine = np.empty((height, width), np.float32)
-    coarse = np.empty((height, width), np.float32)
-    trouble = np.empty((height, width), np.float32)
-    half = np.float32(0.5)
-    for y in range(height):
-        row = y if local else 0
-        for x in range(width):
-            column = x if local else 0
-            a = near[y, x]
-            b = far[y, x]
-            c = np.sqrt(near_energy[y, x])
-            d = np.sqrt(far_energy[y, x])
-            fine_sum = a + b
-            sum_ = c + d
-            q_fine = (a - b) / (fine_sum + _SAFE)
-            q = (c - d) / (sum_ + _SAFE)
-            t_fine = curve[terms - 1, row, column]
-            t = t_fine
-            for k in range(terms - 2, -1, -1):
-                coefficient = curve[k, row, column]
-                t_fine = t_fine * q_fine + coefficient
-                t = t * q + coefficient
-            fine[y, x] = t_fine if fine_sum > 0 else half
-            coarse[y, x] = t if sum_ > 0 else half
-            grey = half * light[y, x]
-            variance = read_variance + gain * grey
-            # The variance of a root-mean-square grows where noise rivals the signal.
-            near_variance = variance * (1 + half * variance / (c * c + _SAFE))
-            far_variance = variance * (1 + half * variance / (d * d + _SAFE))
-            squared = sum_ * sum_
-            noise = (
-                4
-                * noise_weight
-                * noise_weight
-                * (d * d * near_variance + c * c * far_variance)
-                / (squared * squared + _SAFE * _SAFE)
-            )
-            odd = np.float32(0)
-            if modulation.shape[0] > 0:
-                inside = min(max(t, np.float32(0)), np.float32(1))
-                expected = modulation[modulation.shape[0] - 1]
-                for k in range(modulation.shape[0] - 2, -1, -1):
-                    expected = expected * inside + modulation[k]
-                shown = sum_ / (light[y, x] + _SAFE)
-                # The relative difference of two amounts, symmetric and bounded by ±2: near
-                # its zero it is the logarithm of their ratio, at a fraction of the cost.
-                odd = 2 * modulation_weight * (shown - expected) / (shown + expected + _SAFE)
-            trouble[y, x] = noise + odd * odd if sum_ > 0 else np.float32(np.inf)
-    return fine, coarse, trouble
+    left, right = start - smoothing, start + smoothing
+    for x in range(np.uintp(focus_near.shape[1])):
+        n = _QUARTER * (near_energy[x + left] + near_energy[x + right])
+        n += _HALF * near_energy[x + start]
+        f = _QUARTER * (far_energy[x + left] + far_energy[x + right])
+        f += _HALF * far_energy[x + start]
+        s_squared = n + f + _TWO * np.sqrt(n * f)
+        inverse = _ONE / (s_squared + _TINY)
+        q = (n - f) * inverse
+        fine_sum = focus_near[y, x] + focus_far[y, x]
+        q_fine = (focus_near[y, x] - focus_far[y, x]) / (fine_sum + _SAFE)
+        t = curve[0][curve_y, x]
+        t_fine = t
+        for power in curve[1:]:
+            coefficient = power[curve_y, x]
+            t = t * q + coefficient
+            t_fine = t_fine * q_fine + coefficient
+        light = brightness[y, x]
+        noise = (read_variance + gain * light) * inverse
+        noise *= noise_weight * (_ONE + q * q + _TWO * noise)
+        inside = min(max(t, _ZERO), _ONE)
+        expected = modulation[0]
+        for coefficient in modulation[1:]:
+            expected = expected * inside + coefficient
+        # The relative difference of two amounts, symmetric and bounded: near its zero it is the
+        # logarithm of the ratio of their roots, at a fraction of the cost.
+        expected *= light
+        expected *= expected
+        odd = (s_squared - expected) / (s_squared + expected + _TINY)
+        possible = modulation_weight * abs(odd) <= modulation_weight * _ODDEST
+        odd *= modulation_weight
+        fine[at, x + start] = t_fine if fine_sum > _ZERO else _HALF
+        coarse[at, x + start] = t if s_squared > _ZERO else _HALF
+        known = possible and s_squared > _ZERO
+        trouble[at, x + start] = noise + odd * odd if known else _INFINITE
 
 
-@numba.njit(cache=True)
-def _slopes(values, step):  # type: ignore[no-untyped-def]
-    """Central differences over ±step pixels (one-sided at the border), per pixel."""
-    height, width = values.shape
-    slope_x = np.empty((height, width), np.float32)
-    slope_y = np.empty((height, width), np.float32)
-    for y in range(height):
-        above = max(0, y - step)
-        below = min(height - 1, y + step)
-        over = np.float32(1) / np.float32(max(1, below - above))
-        for x in range(width):
-            slope_y[y, x] = (values[below, x] - values[above, x]) * over
-        inner = np.float32(1) / np.float32(2 * step)
-        for x in range(step, width - step):
-            slope_x[y, x] = (values[y, x + step] - values[y, x - step]) * inner
-        for x in range(min(step, width)):
-            right = min(width - 1, x + step)
-            slope_x[y, x] = (values[y, right] - values[y, 0]) / max(1, right)
-        for x in range(max(step, width - step), width):
-            left = max(0, x - step)
-            slope_x[y, x] = (values[y, width - 1] - values[y, left]) / max(1, width - 1 - left)
-    return slope_x, slope_y
+@_rows
+def _moments_row(mean, square, fine, above, at, below):  # type: ignore[no-untyped-def]
+    """Down the columns: means of the fine depth and of its square."""
+    for x in range(np.uintp(mean.shape[0])):
+        a, b, c = fine[above, x], fine[at, x], fine[below, x]
+        mean[x] = _QUARTER * (a + c) + _HALF * b
+        square[x] = _QUARTER * (a * a + c * c) + _HALF * b * b
 
 
-@numba.njit(cache=True)
-def _window_costs(  # type: ignore[no-untyped-def]
-    mean, square, slope_x, slope_y, trouble, guide_mean, guide_square, side
+@_rows
+def _costs_row(  # type: ignore[no-untyped-def]
+    slope_x,
+    slope_y,
+    cost,
+    own,
+    mean,
+    square,
+    coarse,
+    trouble,
+    guide,
+    above,
+    at,
+    below,
+    start,
+    width,
+    step,
+    over_y,
 ):
-    """Squared error of a window, percent²: scatter about a plane, contrasts, and troubles.
+    """Slopes per pixel, and squared errors of windows, percent².
 
-    Also returns the whole scatter (tilt included): where the surface is steep, all that depends
-    on where exactly a pixel looks is worth less.
+    The slopes are central differences of the coarse depth.  ``cost`` is what a window counts to
+    those that hear it: scatter about a plane, contrast, and troubles.  ``own`` is what it counts
+    to its own pixel: the whole scatter (tilt included), since where the surface is steep, all
+    that depends on where exactly a pixel looks is worth less.
     """
-    height, width = mean.shape
-    cost = np.empty((height, width), np.float32)
-    scatter = np.empty((height, width), np.float32)
-    percent = np.float32(100 * 100)
-    moment = np.float32((side * side - 1) / 12)
-    zero = np.float32(0)
-    one = np.float32(1)
-    edge = np.float32(_EDGE_WEIGHT)
-    for y in range(height):
-        for x in range(width):
-            variance = max(square[y, x] - mean[y, x] * mean[y, x], zero)
-            plane = (slope_x[y, x] * slope_x[y, x] + slope_y[y, x] * slope_y[y, x]) * moment
-            scatter[y, x] = percent * variance
-            grey = guide_mean[y, x] * guide_mean[y, x]
-            contrast = max(guide_square[y, x] - grey, zero) / (grey + one)
-            cost[y, x] = percent * max(variance - plane, zero) + trouble[y, x] + edge * contrast
-    return cost, scatter
+    left, right = start - step, start + step
+    # The variance that weights 1/4, 1/2, 1/4 at -step, 0 and step see of a unit slope.
+    moment = _HALF * np.float32(step * step)
+    over_x = _HALF / np.float32(step)
+    for x in range(width):
+        mean_here = _QUARTER * (mean[x + left] + mean[x + right]) + _HALF * mean[x + start]
+        square_here = _QUARTER * (square[x + left] + square[x + right])
+        square_here += _HALF * square[x + start]
+        scatter = max(square_here - mean_here * mean_here, _ZERO)
+        a = (coarse[at, x + right] - coarse[at, x + left]) * over_x
+        b = (coarse[below, x + start] - coarse[above, x + start]) * over_y
+        slope_x[at, x + start] = a
+        slope_y[at, x + start] = b
+        bend = max(scatter - (a * a + b * b) * moment, _ZERO)
+        grey = guide[at, x + start]
+        a = guide[at, x + right] - guide[at, x + left]
+        b = guide[below, x + start] - guide[above, x + start]
+        contrast = (a * a + b * b) / (grey * grey + _ONE)
+        known = trouble[at, x + start]
+        cost[at, x + start] = _PERCENT * bend + known + _EDGE_WEIGHT * contrast
+        own[at, x + start] = _PERCENT * _SCATTER_WEIGHT * scatter + known
+
+
+@numba.njit(inline="always")
+def _weight(cost):  # type: ignore[no-untyped-def]
+    """How much a window of this cost is heard: (cost + floor)⁻⁴, but for a factor.
+
+    The bits of a positive float are, read as an integer and but for a constant, 2²³ times its
+    logarithm, with straight lines between the powers of two.  Minus four times that are the bits
+    of the inverse fourth power, times 1 to 1.35.  A weight needs to be no better; this one is as
+    continuous and as steep, and it spares five divisions a pixel.
+    """
+    logarithm = np.float32(cost + _COST_FLOOR).view(np.int32)
+    return np.int32(_INVERSE_FOURTH_POWER - np.int32(4) * logarithm).view(np.float32)
+
+
+@numba.njit(inline="always")
+def _heard_cost(cost, step, sharpness):  # type: ignore[no-untyped-def]
+    """What a neighbour's window costs a pixel whose brightness is ``step`` away, never NaN."""
+    total = cost + sharpness * step * step + _DISTANCE_COST
+    return total if total < _HIGHEST_COST else _HIGHEST_COST
+
+
+@_rows
+def _hear_row(  # type: ignore[no-untyped-def]
+    out,
+    error,
+    y,
+    depth,
+    slope_x,
+    slope_y,
+    cost,
+    own,
+    guide,
+    above,
+    at,
+    below,
+    start,
+    reach,
+    read_variance,
+    gain,
+):
+    """Each pixel's own window and four neighbours', extrapolated and weighed (module docstring).
+
+    The neighbours lie above left (1), above right (2), below left (3) and below right (4).
+    """
+    left, right = start - reach, start + reach
+    far = np.float32(reach)
+    for x in range(np.uintp(out.shape[1])):
+        here, i, j = x + start, x + left, x + right
+        grey = guide[at, here]
+        light = max(grey, _ZERO)
+        sharpness = _CONTRAST_WEIGHT / (
+            read_variance + gain * light + _RELATIVE_CONTRAST * light * light + _SAFE
+        )
+        c0 = cost[at, here] if cost[at, here] < _HIGHEST_COST else _HIGHEST_COST
+        c1 = _heard_cost(cost[above, i], guide[above, i] - grey, sharpness)
+        c2 = _heard_cost(cost[above, j], guide[above, j] - grey, sharpness)
+        c3 = _heard_cost(cost[below, i], guide[below, i] - grey, sharpness)
+        c4 = _heard_cost(cost[below, j], guide[below, j] - grey, sharpness)
+        w0, w1, w2, w3, w4 = _weight(c0), _weight(c1), _weight(c2), _weight(c3), _weight(c4)
+        over = _ONE / (w0 + w1 + w2 + w3 + w4)
+        value = over * (
+            w0 * depth[at, here]
+            + w1 * (depth[above, i] + far * (slope_x[above, i] + slope_y[above, i]))
+            + w2 * (depth[above, j] - far * (slope_x[above, j] - slope_y[above, j]))
+            + w3 * (depth[below, i] + far * (slope_x[below, i] - slope_y[below, i]))
+            + w4 * (depth[below, j] - far * (slope_x[below, j] + slope_y[below, j]))
+        )
+        heard = over * (w0 * c0 + w1 * c1 + w2 * c2 + w3 * c3 + w4 * c4)
+        moved = value - depth[at, here]
+        squared = _ERROR_SCALE * (own[at, here] + _MOVED_WEIGHT * moved * moved + heard)
+        out[y, x] = value
+        error[y, x] = np.sqrt(squared) if squared < _INFINITE else _INFINITE
+
+
+@_rows
+def _own_row(out, error, y, depth, cost, own, at, start):  # type: ignore[no-untyped-def]
+    """Each pixel's own window alone."""
+    for x in range(np.uintp(out.shape[1])):
+        squared = _ERROR_SCALE * (own[at, x + start] + cost[at, x + start])
+        out[y, x] = depth[at, x + start]
+        error[y, x] = np.sqrt(squared) if squared < _INFINITE else _INFINITE
+
+
+@numba.njit(cache=True)
+def _continue_ends(row, width, margin):  # type: ignore[no-untyped-def]
+    """As :func:`mirror_ends`, but through the end values: a slope goes on as it is."""
+    first, last = row[margin], row[margin + width - 1]
+    for k in range(1, margin + 1):
+        row[margin - k] = _TWO * first - row[margin + mirrored(-k, width)]
+        row[margin + width - 1 + k] = _TWO * last - row[margin + mirrored(width - 1 + k, width)]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _hear_neighbours(  # type: ignore[no-untyped-def]
-    depth, slope_x, slope_y, cost, scatter, trouble, guide, offsets, read_variance, gain
+def _estimate(  # type: ignore[no-untyped-def]
+    focus_near,
+    focus_far,
+    brightness,
+    guide,
+    curve,
+    modulation,
+    modulation_weight,
+    window_read_variance,
+    window_gain,
+    noise_weight,
+    read_variance,
+    gain,
+    smoothing,
+    step,
+    reach,
+    edge_aware,
 ):
-    """Each pixel's own window and its neighbours', extrapolated and weighed (module docstring)."""
-    height, width = depth.shape
+    """Three passes over the rows, each as far behind the one before as it must look ahead.
+
+    Rows are kept in rings with margins on both sides: row y is at ``y % ring``.  Row ``ring``
+    stands for all rows outside the image; it costs so much that it is not heard.
+    """
+    height, width = focus_near.shape
     out = np.empty((height, width), np.float32)
     error = np.empty((height, width), np.float32)
-    value_sum = np.empty(width, np.float32)
-    weight_sum = np.empty(width, np.float32)
-    cost_sum = np.empty(width, np.float32)
-    sharpness = np.empty(width, np.float32)
-    one = np.float32(1)
-    floor = np.float32(_COST_FLOOR)
-    contrast = np.float32(_CONTRAST_WEIGHT)
-    reach = max(one, np.float32(offsets[1, 0]))
-    for y in range(height):
-        for x in range(width):
-            grey = max(guide[y, x], np.float32(0))
-            sigma = np.sqrt(read_variance + gain * grey) + np.float32(_RELATIVE_CONTRAST) * grey
-            sharpness[x] = contrast / (sigma * sigma + _SAFE)
-            value_sum[x] = 0
-            weight_sum[x] = 0
-            cost_sum[x] = 0
-        for n in range(offsets.shape[0]):
-            dx = offsets[n, 0]
-            dy = offsets[n, 1]
-            source = y + dy
-            if source < 0 or source >= height:
-                continue
-            far_x = np.float32(dx)
-            far_y = np.float32(dy)
-            distance = np.float32(_DISTANCE_WEIGHT) * (far_x * far_x + far_y * far_y)
-            distance /= reach * reach
-            for x in range(max(0, -dx), min(width, width - dx)):
-                step = guide[y, x] - guide[source, x + dx]
-                total = cost[source, x + dx] + sharpness[x] * step * step + distance
-                inverse = one / (total + floor)
-                weight = inverse * inverse
-                weight *= weight
-                value = (
-                    depth[source, x + dx]
-                    - slope_x[source, x + dx] * far_x
-                    - slope_y[source, x + dx] * far_y
-                )
-                value_sum[x] += weight * value
-                weight_sum[x] += weight
-                # An infinite cost has no weight, and must not make 0 · inf of it.
-                cost_sum[x] += weight * min(total, np.float32(1e12))
-        for x in range(width):
-            if weight_sum[x] > 0:
-                value = value_sum[x] / weight_sum[x]
-                moved = np.float32(100) * np.float32(_MOVED_WEIGHT) * (value - depth[y, x])
-                squared = (
-                    np.float32(_SCATTER_WEIGHT * _SCATTER_WEIGHT) * scatter[y, x]
-                    + trouble[y, x]
-                    + moved * moved
-                    + cost_sum[x] / weight_sum[x]
-                )
-                out[y, x] = value
-                error[y, x] = np.sqrt(squared)
-            else:
-                out[y, x] = depth[y, x]
-                error[y, x] = np.float32(np.inf)
+    margin = max(smoothing, step, reach)
+    ring = 2 * (step + reach) + 1
+    padded = (ring + 1, width + 2 * margin)
+    grey = np.zeros(padded, np.float32)
+    fine = np.zeros(padded, np.float32)
+    coarse = np.full(padded, _HALF, np.float32)
+    trouble = np.zeros(padded, np.float32)
+    slope_x = np.zeros(padded, np.float32)
+    slope_y = np.zeros(padded, np.float32)
+    own = np.zeros(padded, np.float32)
+    cost = np.full(padded, _HIGHEST_COST, np.float32)
+    near_energy = np.zeros(padded[1], np.float32)
+    far_energy = np.zeros(padded[1], np.float32)
+    mean = np.zeros(padded[1], np.float32)
+    square = np.zeros(padded[1], np.float32)
+    u = np.uintp
+    start = u(margin)
+    curve_is_local = curve[0].shape[0] > 1
+    for newest in range(height + step + reach):
+        y = newest
+        if y < height:
+            above, below = mirrored(y - smoothing, height), mirrored(y + smoothing, height)
+            _energies_row(
+                near_energy, far_energy, start, focus_near, focus_far, u(above), u(y), u(below)
+            )
+            mirror_ends(near_energy, width, margin)
+            mirror_ends(far_energy, width, margin)
+            at = y % ring
+            _depth_row(
+                fine,
+                coarse,
+                trouble,
+                u(at),
+                start,
+                near_energy,
+                far_energy,
+                u(smoothing),
+                focus_near,
+                focus_far,
+                brightness,
+                u(y),
+                curve,
+                u(y if curve_is_local else 0),
+                modulation,
+                modulation_weight,
+                window_read_variance,
+                window_gain,
+                noise_weight,
+            )
+            grey[at, margin : margin + width] = guide[y]
+            mirror_ends(fine[at], width, margin)
+            mirror_ends(grey[at], width, margin)
+            _continue_ends(coarse[at], width, margin)
+        y = newest - step
+        if 0 <= y < height:
+            at = u(y % ring)
+            above, below = mirrored(y - step, height), mirrored(y + step, height)
+            _moments_row(mean, square, fine, u(above % ring), at, u(below % ring))
+            above, below = max(0, y - step), min(height - 1, y + step)
+            over_y = _ONE / np.float32(max(1, below - above))
+            rows = u(above % ring), at, u(below % ring)
+            _costs_row(
+                slope_x,
+                slope_y,
+                cost,
+                own,
+                mean,
+                square,
+                coarse,
+                trouble,
+                grey,
+                *rows,
+                start,
+                u(width),
+                u(step),
+                over_y,
+            )
+            if not edge_aware:
+                _own_row(out, error, u(y), coarse, cost, own, at, start)
+        y = newest - step - reach
+        if edge_aware and y >= 0:
+            above = (y - reach) % ring if y >= reach else ring
+            below = (y + reach) % ring if y + reach < height else ring
+            _hear_row(
+                out,
+                error,
+                u(y),
+                coarse,
+                slope_x,
+                slope_y,
+                cost,
+                own,
+                grey,
+                u(above),
+                u(y % ring),
+                u(below),
+                start,
+                u(reach),
+                read_variance,
+                gain,
+            )
     return out, error
+
+
+def folded_back(
+    focus_sum: np.ndarray,
+    light: np.ndarray,
+    relative_depth: np.ndarray,
+    modulation: np.ndarray,
+    period_px: float,
+    least: float,
+) -> np.ndarray:
+    """Where the curve has folded back: surfaces beyond the focal planes, bool [H W].
+
+    There the ratio takes values that it also has between the planes, but both images are
+    blurred: over a few stripe periods the contrast is less than ``least`` of what the
+    calibration has at that depth.  One window may show so little for other reasons (a rim, a
+    shadow); a neighbourhood of four periods does not.
+
+    ``focus_sum`` is focus_near + focus_far, ``light`` near + far, float32 [H W];
+    ``relative_depth`` [H W] has NaN where unknown; ``modulation`` as in :class:`Response`.
+    """
+    height, width = focus_sum.shape
+    cell = max(1, round(_FOLD_CELL_PERIODS * period_px))
+    size = (max(1, width // cell), max(1, height // cell))
+
+    def cells(image: np.ndarray) -> np.ndarray:
+        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+    def pooled(image: np.ndarray) -> np.ndarray:
+        return cv2.blur(image, _FOLD_CELLS, borderType=cv2.BORDER_REFLECT_101)
+
+    known = np.isfinite(relative_depth)
+    share = cells(known.astype(np.float32))
+    depth = cells(np.where(known, relative_depth, np.float32(0)))
+    depth /= np.maximum(share, _SAFE)
+    expected = np.zeros_like(depth)
+    for coefficient in modulation[::-1]:
+        expected = expected * np.clip(depth, 0, 1) + coefficient
+    there = (share > 0).astype(np.float32)
+    shown = pooled(cells(focus_sum) * there)
+    enough = pooled(expected * cells(light) * there)
+    low = (shown < np.float32(least) * enough).astype(np.uint8)
+    return cv2.resize(low, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
 
 def confidence_from_error(error_percent: np.ndarray, half_at_percent: float) -> np.ndarray:
@@ -413,5 +596,15 @@ def confidence_from_error(error_percent: np.ndarray, half_at_percent: float) -> 
 
     1 / (1 + (error / half)²): smooth, never quite certain, and 0 for an infinite error.
     """
-    ratio = error_percent * np.float32(1 / half_at_percent)
-    return (1 / (1 + ratio * ratio)).astype(np.float32, copy=False)
+    errors = np.ascontiguousarray(error_percent, np.float32)
+    confidence = _confidence(errors.ravel(), np.float32(1 / half_at_percent))
+    return confidence.reshape(errors.shape)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _confidence(errors, over_half):  # type: ignore[no-untyped-def]
+    out = np.empty_like(errors)
+    for i in range(errors.size):
+        ratio = errors[i] * over_half
+        out[i] = _ONE / (_ONE + ratio * ratio)
+    return out

@@ -12,11 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
+import numba
 import numpy as np
 
 _MATCH_ROUNDS = 3
 _OUTLIER_SIGMAS = 4.0
 _SMALLEST_FOR_DRIFT_PX = 32
+_DRIFT_ROWS = 64
+_DRIFT_SHRINK = 4
 
 
 @dataclass(frozen=True)
@@ -272,20 +275,102 @@ def _equalised(image: np.ndarray) -> np.ndarray:
 def misalignment_rms_px(near: np.ndarray, far: np.ndarray) -> float:
     """Root mean square misalignment that is left between two registered images [H W], pixels.
 
-    One Gauss-Newton step away from no motion, taken as the root mean square over the image of
-    the motion that it asks for.  Directions that the images do not show count as aligned; an
-    image without contrast gives 0.
+    One Gauss-Newton step of :func:`refine_similarity` away from no motion, taken as the root
+    mean square over the image of the motion that it asks for.  Directions that the images do
+    not show count as aligned; an image without contrast gives 0.
+
+    This runs on every frame, so it looks at some 64 rows and takes the local mean and contrast,
+    which are smooth, from images shrunk by four.  The images themselves must not be shrunk:
+    stripes of five pixels would have no true gradient left.
     """
     height, width = near.shape
     if min(height, width) < _SMALLEST_FOR_DRIFT_PX:
         return 0.0
-    start = Similarity.identity(width, height)
-    step = refine_similarity([(near, far)], start, iterations=1)
-    # Over a rectangle the mean square of a linear map equals that over its four points at
-    # 1/√3 of the half sides.
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    signs = np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)])
-    points = np.column_stack([middle + signs * middle / math.sqrt(3), np.ones(4)])
-    motion = points @ step.far_from_near.T - points[:, :2]
-    rms = float(np.sqrt((motion**2).sum(axis=1).mean()))
-    return rms if math.isfinite(rms) else 0.0
+    margin = max(4, round(0.04 * min(width, height)))
+    stride = max(1, height // _DRIFT_ROWS)
+    normal, right = _normal_equations(_evened(near), _evened(far), margin, stride)
+    if not (np.isfinite(normal).all() and np.isfinite(right).all() and normal.any()):
+        return 0.0
+    values, vectors = np.linalg.eigh(normal)
+    good = values > 1e-2 * values[-1]
+    turn_a, turn_b, dx, dy = vectors[:, good] @ ((vectors[:, good].T @ right) / values[good])
+    # The step's first two numbers are motions at half the shorter side away from the middle, and
+    # the mean square distance from the middle is a third of that to a corner.
+    half = min(width, height) / 2
+    distance = ((width - 1) ** 2 + (height - 1) ** 2) / 12 / half**2
+    return math.sqrt((turn_a**2 + turn_b**2) * distance + dx**2 + dy**2)
+
+
+def _evened(image: np.ndarray) -> np.ndarray:
+    """As :func:`_equalised`, with local mean and contrast from a shrunk image; C-contiguous."""
+    height, width = image.shape
+    small = (max(1, width // _DRIFT_SHRINK), max(1, height // _DRIFT_SHRINK))
+    side = max(3, round(min(height, width) / 12 / _DRIFT_SHRINK) | 1)
+
+    def local_mean(values: np.ndarray) -> np.ndarray:
+        return cv2.blur(cv2.resize(values, small, interpolation=cv2.INTER_AREA), (side, side))
+
+    def enlarged(values: np.ndarray) -> np.ndarray:
+        return cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
+
+    smooth: np.ndarray = cv2.GaussianBlur(image.astype(np.float32, copy=False), (9, 9), 1.5)
+    centred = smooth - enlarged(local_mean(smooth))
+    contrast = np.sqrt(local_mean(centred * centred))
+    over = 1 / (contrast + np.float32(0.02) * contrast.max() + np.float32(1e-6))
+    return centred * enlarged(over)
+
+
+@numba.njit(cache=True, fastmath={"contract", "reassoc"})
+def _normal_equations(near, far, margin, stride):  # type: ignore[no-untyped-def]
+    """JᵀJ [4 4] and Jᵀr [4] of a similarity step, over every ``stride``-th row, float64.
+
+    The columns of J are the image's gradient against turning and scaling about the middle (in
+    units of half the shorter side) and against shifts, from the Sobel derivatives of the mean of
+    both images; r is near less far.  Sums run in float32 along a row, so that they are SIMD,
+    and in float64 over the rows.
+    """
+    height, width = near.shape
+    normal = np.zeros((4, 4))
+    right = np.zeros(4)
+    middle_x, middle_y = np.float32((width - 1) / 2), np.float32((height - 1) / 2)
+    over = np.float32(2 / min(width, height))
+    two = np.float32(2)
+    # 1/8 of the Sobel kernel, 1/2 of the mean.
+    unit = np.float32(1 / 16)
+    for y in range(margin, height - margin, stride):
+        near_0, near_1, near_2 = near[y - 1], near[y], near[y + 1]
+        far_0, far_1, far_2 = far[y - 1], far[y], far[y + 1]
+        v = (np.float32(y) - middle_y) * over
+        aa = ab = ax = ay = bb = bx = by = xx = xy = yy = np.float32(0)
+        ra = rb = rx = ry = np.float32(0)
+        for x in range(margin, width - margin):
+            above_left = near_0[x - 1] + far_0[x - 1]
+            above_right = near_0[x + 1] + far_0[x + 1]
+            below_left = near_2[x - 1] + far_2[x - 1]
+            below_right = near_2[x + 1] + far_2[x + 1]
+            across = near_1[x + 1] + far_1[x + 1] - near_1[x - 1] - far_1[x - 1]
+            down = near_2[x] + far_2[x] - near_0[x] - far_0[x]
+            gx = unit * (above_right - above_left + below_right - below_left + two * across)
+            gy = unit * (below_left - above_left + below_right - above_right + two * down)
+            u = (np.float32(x) - middle_x) * over
+            ga = gx * u + gy * v
+            gb = gx * v - gy * u
+            residual = near_1[x] - far_1[x]
+            aa += ga * ga
+            ab += ga * gb
+            ax += ga * gx
+            ay += ga * gy
+            bb += gb * gb
+            bx += gb * gx
+            by += gb * gy
+            xx += gx * gx
+            xy += gx * gy
+            yy += gy * gy
+            ra += ga * residual
+            rb += gb * residual
+            rx += gx * residual
+            ry += gy * residual
+        upper = ((aa, ab, ax, ay), (ab, bb, bx, by), (ax, bx, xx, xy), (ay, by, xy, yy))
+        normal += np.array(upper, np.float64)
+        right += np.array((ra, rb, rx, ry), np.float64)
+    return normal, right
