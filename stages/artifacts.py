@@ -38,6 +38,7 @@ STRIPES = Artifact("stripes", doc="period and direction of the projected stripes
 DRIFT = Artifact(
     "registration_drift_px", doc="root mean square misalignment left over the image, pixels"
 )
+FULL_SCALE = Artifact("full_scale", doc="grey level at which the sensors saturate; inf if unknown")
 GAIN_DRIFT = Artifact("gain_drift", doc="near over far light, against the calibration; 1 is none")
 
 FOCUS_NEAR = Artifact("focus_near", "float32", "H W", "grey levels", "focus measure, near")
@@ -54,4 +55,25 @@ RELATIVE = Artifact(
 CONFIDENCE = Artifact("confidence", "float32", "H W", "0..1", "trust in the depth")
 CLOUD = Artifact("cloud_xyz_m", "float32", "N 3", "m", "points in camera_optical_frame")
 CLOUD_NORMALS = Artifact("cloud_normals", "float32", "N 3", "", "unit normals, to the camera")
+GRADIENT = Artifact(
+    "gradient", "float32", "H W", "grey levels", "magnitude of the operator's gradient"
+)
+EDGES_LOW = Artifact("edges_low", "bool", "H W", "", "low resolution: the coarsest image")
+EDGES_MEDIUM = Artifact("edges_medium", "bool", "H W", "", "medium resolution, contains the low")
+EDGES_HIGH = Artifact("edges_high", "bool", "H W", "", "high resolution, contains the medium")
+EDGE_CHOICE = Artifact("edge_choice", doc="how the thresholds were chosen, and what the links need")
+
+EDGES_RECONSTRUCTED = Artifact("edges_reconstructed", "bool", "H W", "", "after section 4.1")
+TERMINATORS = Artifact("terminators", "int32", "N 2", "px", "(x, y) of each end before linking")
+DIRECTIONS = Artifact("terminator_directions", "float32", "N 2", "", "unit vectors, outwards")
+LINKS = Artifact("links", "bool", "H W", "", "pixels that links added")
+EDGES_LINKED = Artifact("edges_linked", "bool", "H W", "", "after section 4.2")
+REGION_LINES = Artifact("region_lines", "bool", "H W", "", "what bounds regions")
+EDGE_STEP = Artifact("edge_step", "uint8", "H W", "", "which step decided on the pixel")
+EDGE_VALUE = Artifact("edge_value", "float32", "H W", "", "the value by which it decided")
+LINKING = Artifact("linking", doc="each iteration of the reconstruction, and every link")
+
+LABELS = Artifact("labels", "int32", "H W", "", "region of each pixel, 0 = none")
+REGIONS = Artifact("regions", doc="one row a region, a numpy structured array; see the stage")
+
 CLOUD_INTENSITY = Artifact("cloud_intensity", "float32", "N", "grey levels", "brightness")

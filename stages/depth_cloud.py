@@ -87,7 +87,7 @@ class DepthCloud(Stage):
             unit="stripe periods",
         )
         half_confidence_error_percent: float = knob(
-            3.2,
+            3.3,
             "The predicted error at which confidence is one half.",
             low=0.2,
             high=50,

@@ -10,6 +10,7 @@ from stages.artifacts import (
     FAR,
     FAR_IMAGE,
     FLAT_IMAGE,
+    FULL_SCALE,
     GAIN_DRIFT,
     INTENSITY,
     NEAR,
@@ -44,7 +45,7 @@ class Registration(Stage):
     name = "registration"
     chapter = "sensor"
     needs = (NEAR_IMAGE, FAR_IMAGE, FLAT_IMAGE, CALIBRATION)
-    gives = (NEAR, FAR, INTENSITY, SATURATED, STRIPES, DRIFT, GAIN_DRIFT)
+    gives = (NEAR, FAR, INTENSITY, SATURATED, FULL_SCALE, STRIPES, DRIFT, GAIN_DRIFT)
 
     class Parameters(StageParameters):
         similarity: Literal["calibration", "pair", "none"] = knob(
@@ -105,7 +106,9 @@ class Registration(Stage):
             parameters.similarity == "calibration" and calibration is None
         ):
             similarity = refine_similarity([(near, far)], similarity)
-        limit = parameters.saturation_percent / 100 * full_scale(near_raw, far_raw)
+        flat = inputs["flat_image"]
+        top = full_scale(*(image for image in (near_raw, far_raw, flat) if image is not None))
+        limit = parameters.saturation_percent / 100 * top
         saturated = (near >= limit) | ~np.isfinite(near)
         far_saturated = (far >= limit) | ~np.isfinite(far)
         if far_saturated.any():
@@ -129,7 +132,6 @@ class Registration(Stage):
         drift_px = misalignment_rms_px(near, far)
         if drift_px > _DRIFT_WARNING_PX:
             warnings.append(f"near and far are {drift_px:.1f} px apart after registration")
-        flat = inputs["flat_image"]
         if flat is not None and parameters.intensity == "flat":
             intensity = grey(flat)
             if intensity.shape != near.shape:
@@ -141,6 +143,7 @@ class Registration(Stage):
             "far": far,
             "intensity": intensity,
             "saturated": saturated,
+            "full_scale": top,
             "stripes": stripes,
             "registration_drift_px": drift_px,
             "gain_drift": gain_drift,

@@ -17,6 +17,8 @@ import rerun.blueprint as rrb
 
 UNKNOWN_COLOUR = (62, 62, 70)
 DARK = (14, 14, 16)
+_SHADOW_COLOUR = (95, 95, 105)
+_CHART_WIDTH, _CHART_HEIGHT = 100.0, 60.0
 _TICK_COLOUR = (90, 150, 215)  # readable on the labels of the dark and of the light theme
 _BAR_STEPS = 64
 _BAR_ROOM = 1.3
@@ -148,5 +150,86 @@ def map_view(path: str, name: str, shape: tuple[int, ...]) -> Any:
         background=DARK,
         visual_bounds=rrb.VisualBounds2D(
             x_range=(0, width * _BAR_ROOM), y_range=(-0.02 * height, 1.02 * height)
+        ),
+    )
+
+
+def edge_image(edges: np.ndarray) -> Any:
+    """Edges [H W] bool, white on black."""
+    return rr.Image(edges.view(np.uint8) * np.uint8(255))
+
+
+def linked_image(step: np.ndarray, lines: np.ndarray) -> Any:
+    """Lines [H W] by the step that drew them: the paper shades its links (figure 7)."""
+    from stages.edges.linking import Step
+
+    rgb = np.full((*step.shape, 3), DARK, np.uint8)
+    rgb[lines] = _SHADOW_COLOUR
+    for first, colour in (
+        (Step.LOW, (255, 255, 255)),
+        (Step.LINK, (255, 150, 40)),
+        (Step.CREASE, (80, 160, 255)),
+    ):
+        rgb[lines & (step >= first)] = colour
+    return rr.Image(rgb)
+
+
+def log_chart(
+    recording: Any,
+    path: str,
+    x: np.ndarray,
+    y: np.ndarray,
+    marks: dict[str, float],
+    level: float | None = None,
+) -> None:
+    """A curve y(x) as lines in a unit square, with marked places on x and a level on y.
+
+    Rerun's plots have time along x; a threshold's curve has no time.
+    """
+    width = max(float(x[-1]), 1e-9)
+    top = max(float(y.max(initial=0)), level or 0.0, 1e-9) * 1.05
+
+    def place(u: float, v: float) -> tuple[float, float]:
+        return (u / width * _CHART_WIDTH, _CHART_HEIGHT * (1 - v / top))
+
+    curve = np.column_stack([x / width * _CHART_WIDTH, _CHART_HEIGHT * (1 - y / top)])
+    frame = [(0, 0), (0, _CHART_HEIGHT), (_CHART_WIDTH, _CHART_HEIGHT)]
+    strips: list[Any] = [curve, frame]
+    colours = [(240, 190, 90), (120, 120, 130)]
+    if level is not None:
+        strips.append([place(0, level), place(width, level)])
+        colours.append((120, 120, 130))
+    for value in marks.values():
+        strips.append([place(value, 0), place(value, top)])
+        colours.append((235, 80, 80))
+    recording.log(path, rr.LineStrips2D(strips, colors=colours, radii=0.5))
+    labels = [f"{name} {value:.1f}" for name, value in marks.items()]
+    # Below one another, for thresholds may lie close.
+    spots = [
+        (place(value, 0)[0], _CHART_HEIGHT * (0.1 + 0.22 * k))
+        for k, value in enumerate(marks.values())
+    ]
+    recording.log(
+        f"{path}/marks",
+        rr.Points2D(spots, labels=labels, colors=(235, 80, 80), radii=0.3, show_labels=True),
+    )
+    ends = [(0, _CHART_HEIGHT), (_CHART_WIDTH, _CHART_HEIGHT)]
+    recording.log(
+        f"{path}/scale",
+        rr.Points2D(
+            ends, labels=["0", f"{width:.0f}"], colors=_TICK_COLOUR, radii=0.3, show_labels=True
+        ),
+    )
+
+
+def chart_view(path: str, name: str) -> Any:
+    """A view of what :func:`log_chart` logged."""
+    return rrb.Spatial2DView(
+        origin=path,
+        name=name,
+        background=DARK,
+        visual_bounds=rrb.VisualBounds2D(
+            x_range=(-0.06 * _CHART_WIDTH, 1.06 * _CHART_WIDTH),
+            y_range=(-0.05 * _CHART_HEIGHT, 1.3 * _CHART_HEIGHT),
         ),
     )

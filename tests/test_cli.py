@@ -21,7 +21,14 @@ from workbench.cli import app
 Command = Callable[..., Any]
 ROOT = Path(__file__).parents[1]
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-STAGES = ["registration", "focus_maps", "depth_cloud"]
+STAGES = [
+    "registration",
+    "focus_maps",
+    "depth_cloud",
+    "edge_stack",
+    "linked_edges",
+    "region_features",
+]
 
 
 # -- what is documented ---------------------------------------------------------------------------
@@ -368,7 +375,8 @@ def test_without_a_calibration_depth_is_relative_and_says_so(
     assert ended.code == 0 and "relative" in json.dumps(ended.json["warnings"])
     with np.load(tmp_path / "out" / "frame_000000.npz") as file:
         assert np.isnan(file["depth_m"]).all() and not np.isnan(file["depth_relative"]).all()
-    assert "no calibration" in bench("evaluate", alone).mistake
+    evaluated = bench("evaluate", alone, "--frames", "0:1", "--until", "depth_cloud")
+    assert "no calibration" in evaluated.mistake
 
 
 def test_nothing_to_score_is_told_in_one_line(bench: Command, twins: dict[str, Path]) -> None:

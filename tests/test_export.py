@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,9 @@ def test_one_line_a_frame(bench: Command, scene: Path, tmp_path: Path) -> None:
     assert [line["stamp_ns"] for line in found] == sorted(line["stamp_ns"] for line in found)
     for line in found:
         assert line.keys() >= {"index", "stamp_ns", "verdict", "poses", "stage_ms", "warnings"}
-        assert set(line["stage_ms"]) == {"registration", "focus_maps", "depth_cloud"}
+        assert set(line["stage_ms"]) == {
+            entry.name for entry in entry_points(group="workbench.stages")
+        }
         assert all(ms > 0 for ms in line["stage_ms"].values())
     provenance = json.loads((tmp_path / "out" / "provenance.json").read_text())
     assert provenance == ended.json["provenance"]
@@ -124,7 +127,8 @@ def test_python_gives_what_the_command_line_writes(
         assert run.frame.index == index and run.failures == ()
         with np.load(tmp_path / "out" / f"frame_{index:06d}.npz") as file:
             for name in file.files:
-                np.testing.assert_array_equal(file[name], run.artifacts[name], err_msg=name)
+                # Bytes, for the NaN of a table's row equals nothing, not even itself.
+                assert file[name].tobytes() == np.asarray(run.artifacts[name]).tobytes(), name
 
 
 def test_a_stage_that_fails_leaves_the_others_results(

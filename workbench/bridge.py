@@ -25,6 +25,7 @@ STAMP_TIMELINE = "stamp"
 _OK = (86, 160, 110)
 _BROKEN = (214, 70, 60)
 _SOURCE = (90, 130, 200)
+_CHAPTER_SHARE = 2.4
 
 
 class Bridge:
@@ -170,50 +171,64 @@ class Bridge:
     def blueprint(
         self, run: Run, scored: bool, broken: Mapping[str, str], report: RunReport
     ) -> rrb.Blueprint:
-        """One row that reads from left to right, stage after stage, and a shelf below it.
+        """A row for each chapter of the pipeline, read from left to right, and a shelf below.
 
         Stages in ``broken`` have nothing to show; their errors are among the defects.
         """
-        columns: list[Any] = [
-            rrb.Vertical(
-                *(
-                    rrb.Spatial2DView(origin=f"recorded/{channel}", name=f"recorded {channel}")
-                    for channel in run.frame.images
-                ),
-                name="recording",
-            )
-        ]
-        shares = [1.0]
+        recorded = rrb.Vertical(
+            *(
+                rrb.Spatial2DView(origin=f"recorded/{channel}", name=f"recorded {channel}")
+                for channel in run.frame.images
+            ),
+            name="recording",
+        )
+        rows: dict[str, list[Any]] = {}
         for stage in self.session.pipeline.stages:
+            row = rows.setdefault(stage.chapter, [] if rows else [recorded])
             if stage.name in broken:
                 continue
             try:
-                views = list(stage.views(self._logged(run, stage.name)))
+                row += stage.views(self._logged(run, stage.name))
             except Exception as error:
                 report.fail(stage.name, f"its views: {one_line(error)}")
-                continue
-            for view in views:
-                columns.append(view)
-                shares.append(1.7 if isinstance(view, rrb.Spatial3DView) else 1.0)
         shelf: list[Any] = []
         if scored:
-            shelf.append(rrb.TimeSeriesView(origin="bench/scores", name="against ground truth"))
+            shelf.append(
+                rrb.TimeSeriesView(
+                    origin="bench/scores",
+                    name="against ground truth",
+                    plot_legend=rrb.Corner2D.LeftTop,
+                )
+            )
         shelf += [
-            rrb.TimeSeriesView(origin="bench/times", name="stage times, ms"),
+            rrb.TimeSeriesView(
+                origin="bench/times", name="stage times, ms", plot_legend=rrb.Corner2D.LeftTop
+            ),
             rrb.TextDocumentView(origin="bench/defects", name="defects"),
             rrb.TextDocumentView(origin="bench/parameters", name="parameters and provenance"),
             rrb.GraphView(origin="bench/pipeline", name="pipeline"),
         ]
+        chapters = [
+            rrb.Horizontal(*row, column_shares=[_share(view) for view in row], name=chapter)
+            for chapter, row in rows.items()
+            if row
+        ]
         return rrb.Blueprint(
             rrb.Vertical(
-                rrb.Horizontal(*columns, column_shares=shares),
-                rrb.Horizontal(*shelf),
-                row_shares=[2.6, 1],
+                *chapters,
+                rrb.Horizontal(*shelf, column_shares=[1.0] * (len(shelf) - 1) + [1.8]),
+                row_shares=[_CHAPTER_SHARE] * len(chapters) + [1],
             ),
             rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
             rrb.SelectionPanel(state="collapsed"),
             rrb.BlueprintPanel(state="collapsed"),
         )
+
+
+def _share(view: Any) -> float:
+    """How wide a column is: the more pictures are stacked in it, the smaller each can be."""
+    stacked = len(list(view.contents)) if isinstance(view, rrb.Container) else 1
+    return 1.0 / max(1, stacked) ** 0.8
 
 
 def _placed(nodes: list[str], edges: list[tuple[str, str]]) -> list[tuple[float, float]]:
@@ -228,7 +243,7 @@ def _placed(nodes: list[str], edges: list[tuple[str, str]]) -> list[tuple[float,
     for node in nodes:
         row = taken.get(rank[node], 0)
         taken[rank[node]] = row + 1
-        places.append((rank[node] * 130.0, (row - (size[rank[node]] - 1) / 2) * 45.0))
+        places.append((rank[node] * 125.0, (row - (size[rank[node]] - 1) / 2) * 34.0))
     return places
 
 

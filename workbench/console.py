@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
@@ -90,7 +90,40 @@ def score_rows(stage: str, scores: Iterable[Score]) -> Iterator[tuple[str, ...]]
 SCORE_COLUMNS = ("stage", "figure", "value", "unit", "covered", "note")
 
 
-def closing_tables(report: RunReport) -> None:
+def scores_beside(scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> None:
+    """Scores of several presets side by side: one column a preset, with what it covers."""
+    rows: dict[tuple[str, str, str], dict[str, Score]] = {}
+    for preset, stages in scores.items():
+        for stage, own in stages.items():
+            for score in own:
+                rows.setdefault((stage, score.name, score.unit), {})[preset] = score
+    if not rows:
+        return
+    table(
+        "Against ground truth",
+        ("stage", "figure", *(f"{preset or 'this'} value" for preset in scores), "unit", "note"),
+        (
+            (
+                stage,
+                figure,
+                *(_with_coverage(found.get(preset)) for preset in scores),
+                unit,
+                next(iter(found.values())).note,
+            )
+            for (stage, figure, unit), found in rows.items()
+        ),
+    )
+
+
+def _with_coverage(score: Score | None) -> str:
+    if score is None or not math.isfinite(score.value):
+        return "none"
+    if score.coverage is None:
+        return f"{score.value:.3f}"
+    return f"{score.value:.3f} at {100 * score.coverage:.1f} %"
+
+
+def closing_tables(report: RunReport, scores: bool = True) -> None:
     """The end of a run: frames, defects, times, accuracy, failures, warnings."""
     defects = report.session.recording.defects
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(defects.counts.items()))
@@ -107,9 +140,9 @@ def closing_tables(report: RunReport) -> None:
                 for name in report.times_ms
             ),
         )
-    scores = report.scores()
-    if scores:
-        rows = [row for stage, own in scores.items() for row in score_rows(stage, own)]
+    found = report.scores() if scores else {}
+    if found:
+        rows = [row for stage, own in found.items() for row in score_rows(stage, own)]
         table("Against ground truth", SCORE_COLUMNS, rows)
     for says, count in report.warnings.items():
         out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)

@@ -249,7 +249,8 @@ class Logged:
     """What :meth:`Stage.log` may look at: everything known of this frame so far."""
 
     artifacts: Mapping[str, Any]
-    parameters: StageParameters
+    parameters: Any
+    """The stage's own ``Parameters``."""
     truth: Any = None
 
 
@@ -264,6 +265,8 @@ class Stage:
     needs: ClassVar[Sequence[Artifact]] = ()
     gives: ClassVar[Sequence[Artifact]] = ()
     Parameters: ClassVar[type[StageParameters]] = StageParameters
+    chapter: ClassVar[str] = ""
+    """Stages of one chapter share a row of the viewer's layout."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Preset name to the parameters in which it differs from the defaults."""
 

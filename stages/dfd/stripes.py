@@ -117,10 +117,27 @@ def average_over_period(image: np.ndarray, stripes: Stripes | None) -> np.ndarra
     values = image.astype(np.float32, copy=False)
     if stripes is None:
         return values
-    across = whole_period_taps(stripes.extent_px())
-    alone = np.ones(1, np.float32)
-    x_taps, y_taps = (across, alone) if stripes.upright else (alone, across)
-    return cv2.sepFilter2D(values, cv2.CV_32F, x_taps, y_taps, borderType=cv2.BORDER_REFLECT_101)
+    extent = stripes.extent_px()
+    across = whole_period_taps(min(extent, values.shape[1 if stripes.upright else 0]))
+    reach = len(across) // 2
+    axis = 1 if stripes.upright else 0
+    wide = np.take(values, _continued(values.shape[axis], reach, max(1, round(extent))), axis)
+    kernel = across[None] if stripes.upright else across[:, None]
+    inner = [slice(None)] * 2
+    inner[axis] = slice(reach, reach + values.shape[axis])
+    return np.ascontiguousarray(cv2.filter2D(wide, cv2.CV_32F, kernel)[tuple(inner)])
+
+
+def _continued(size: int, reach: int, period: int) -> np.ndarray:
+    """Indices -reach … size + reach, those outside taken whole periods further in.
+
+    A mirror image would break the stripes' beat and leave a line along the border.
+    """
+    index = np.arange(-reach, size + reach)
+    index = np.where(index < 0, index + period * (-(index // period)), index)
+    over = np.maximum(0, index - (size - 1))
+    index = index - period * -(-over // period)
+    return np.clip(index, 0, size - 1)
 
 
 def _odd(value: float) -> int:

@@ -1,0 +1,223 @@
+"""Stage ``edge_stack``: one gradient, and hysteresis at a stack of thresholds (section 4.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from stages.artifacts import (
+    DEPTH,
+    EDGE_CHOICE,
+    EDGES_HIGH,
+    EDGES_LOW,
+    EDGES_MEDIUM,
+    FULL_SCALE,
+    GRADIENT,
+    INTENSITY,
+    RELATIVE,
+)
+from workbench.stage import (
+    WARNINGS,
+    Finding,
+    Inputs,
+    Logged,
+    Outputs,
+    Scorer,
+    Stage,
+    StageParameters,
+    knob,
+)
+
+
+class EdgeStackStage(Stage):
+    """The low threshold rises until few enough edge pixels lie in small segments; then the high
+    one rises to the operator's greatest, which gives images of low, medium and high resolution.
+
+    ``paper`` takes the GEF operator and thresholds in grey levels.  ``default`` takes Canny's
+    gradient in standard deviations of its own noise, measured from the image.
+    """
+
+    name = "edge_stack"
+    chapter = "segmentation"
+    needs = (INTENSITY, FULL_SCALE, DEPTH.optional(), RELATIVE.optional())
+    gives = (GRADIENT, EDGES_LOW, EDGES_MEDIUM, EDGES_HIGH, EDGE_CHOICE)
+
+    class Parameters(StageParameters):
+        operator: Literal["canny", "gef"] = knob(
+            "canny",
+            "Canny's Gaussian derivative (σ = 1), or the ISEF-based GEF (a0 = 0.45).",
+        )
+        noise_units: bool = knob(
+            True,
+            "Thresholds in standard deviations of the gradient's noise, measured from the image, "
+            "instead of grey levels of 8 bit.",
+        )
+        lowest: float = knob(
+            2.0,
+            "Where the search for the low threshold starts.",
+            low=0.1,
+            high=50,
+            step=0.1,
+            unit="grey levels, or σ of the noise",
+        )
+        greatest: float = knob(
+            20.0,
+            "The greatest high threshold: 20 for GEF on 8 bit.",
+            low=1,
+            high=255,
+            step=1,
+            unit="grey levels, or σ of the noise",
+        )
+        max_ratio: float = knob(
+            0.015,
+            "The low threshold is the least at which edge pixels in small segments are fewer "
+            "than this share of those in large ones.",
+            low=0.001,
+            high=1,
+            step=0.001,
+            unit="small over large",
+        )
+        small_segment: float = knob(
+            4.0,
+            "Segments under this many pixels are small: mostly noise.",
+            low=1,
+            high=50,
+            step=1,
+            unit="px at 256²",
+        )
+        steps: int = knob(
+            128,
+            "Thresholds that the search tries; they cost nothing.",
+            low=2,
+            high=1024,
+            step=1,
+            unit="thresholds",
+        )
+        use_depth: bool = knob(
+            True, "Let the depth tell lines on the background, which may be shadows, from edges."
+        )
+        depth_gain: float = knob(
+            0.0,
+            "How much a depth step or crease strengthens the gradient: 0 leaves it alone.",
+            low=0,
+            high=5,
+            step=0.1,
+            unit="factor",
+        )
+        background_factor: float = knob(
+            1.1,
+            "Pixels no brighter than this many times what the depth cannot see are background.",
+            low=0,
+            high=5,
+            step=0.05,
+            unit="factor",
+        )
+
+    presets = {
+        "paper": {
+            "operator": "gef",
+            "noise_units": False,
+            "lowest": 1.0,
+            "max_ratio": 0.05,
+            "use_depth": False,
+        }
+    }
+
+    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+        from stages.edges.inputs import best_depth
+        from stages.edges.segmentation import stack_edges
+
+        depth, _ = best_depth(inputs)
+        top = inputs["full_scale"]
+        result = stack_edges(
+            inputs["intensity"],
+            depth,
+            full_scale=top if math.isfinite(top) else None,
+            **parameters.model_dump(),
+        )
+        warnings = []
+        if not result.stack.upheld:
+            warnings.append(
+                f"no threshold keeps small segments under max_ratio {parameters.max_ratio:g}; "
+                f"low is {result.stack.low_threshold:.2f}"
+            )
+        return {
+            "gradient": result.gradient.magnitude,
+            "edges_low": result.edges_low,
+            "edges_medium": result.edges_medium,
+            "edges_high": result.edges_high,
+            "edge_choice": result,
+            WARNINGS: warnings,
+        }
+
+    def log(self, recording: Any, logged: Logged) -> None:
+        import numpy as np
+
+        from stages.show import edge_image, log_chart, log_map
+
+        artifacts = logged.artifacts
+        stack = artifacts["edge_choice"].stack
+        gradient = artifacts["gradient"]
+        top = max(float(np.percentile(gradient, 99.5)), 1e-6)
+        log_map(
+            recording, "edge_stack/gradient", np.minimum(gradient, top), 0, top, "magma",
+            ("0", f"{top / 2:.1f}", f"{top:.1f}"),
+        )  # fmt: skip
+        strength = stack.strength[stack.strength > 0]
+        counts, edges = np.histogram(strength, bins=96, range=(0, float(stack.thresholds[-1])))
+        names = ("low res.", "medium res.", "high res. = low")
+        highs = dict(zip(names, stack.high_thresholds, strict=True))
+        log_chart(recording, "edge_stack/histogram", edges[:-1], np.log10(1 + counts), highs)
+        ratio = np.nan_to_num(np.minimum(stack.ratio, 5 * logged.parameters.max_ratio), nan=0.0)
+        log_chart(
+            recording,
+            "edge_stack/ratio",
+            stack.thresholds,
+            ratio,
+            {"low threshold": stack.low_threshold},
+            level=logged.parameters.max_ratio,
+        )
+        for name in ("low", "medium", "high"):
+            recording.log(f"edge_stack/{name}", edge_image(artifacts[f"edges_{name}"]))
+
+    def views(self, logged: Logged) -> list[Any]:
+        import rerun.blueprint as rrb
+
+        from stages.show import chart_view, map_view
+
+        shape = logged.artifacts["gradient"].shape
+        unit = "σ" if logged.parameters.noise_units else "grey levels"
+        return [
+            rrb.Vertical(
+                map_view("edge_stack/gradient", "gradient", shape),
+                chart_view("edge_stack/histogram", f"log histogram, thresholds ({unit})"),
+                chart_view("edge_stack/ratio", f"small / large over threshold ({unit})"),
+                name=self.name,
+            ),
+            rrb.Vertical(
+                rrb.Spatial2DView(origin="edge_stack/low", name="5a low resolution"),
+                rrb.Spatial2DView(origin="edge_stack/medium", name="5b medium resolution"),
+                rrb.Spatial2DView(origin="edge_stack/high", name="5c high resolution"),
+                name="the stack",
+            ),
+        ]
+
+    def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        stack = artifacts["edge_choice"].stack
+        strength = float(stack.strength[y, x])
+        peak = float(stack.segment_peak[y, x])
+        low, high = stack.low_threshold, stack.high_thresholds[0]
+        values = {"strength": strength, "low": low, "high": high, "segment_peak": peak}
+        if not artifacts["edge_choice"].gradient.thin[y, x]:
+            says = f"gradient {strength:.1f} is no maximum across its edge"
+        elif strength < low:
+            says = f"gradient {strength:.1f} is under low {low:.1f}"
+        else:
+            says = f"gradient {strength:.1f} is over low {low:.1f}; its segment reaches {peak:.1f}"
+        return [Finding(says, values, "max_ratio")]
+
+    def scorer(self) -> Scorer:
+        from stages.edges.scorers import EdgeScorer
+
+        return EdgeScorer({"edges_high": "before reconstruction"})
