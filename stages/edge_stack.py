@@ -17,6 +17,7 @@ from stages.artifacts import (
     INTENSITY,
     RELATIVE,
 )
+from stages.edges.presets import PRESETS
 from workbench.stage import (
     WARNINGS,
     Finding,
@@ -114,15 +115,7 @@ class EdgeStackStage(Stage):
             unit="factor",
         )
 
-    presets = {
-        "paper": {
-            "operator": "gef",
-            "noise_units": False,
-            "lowest": 1.0,
-            "max_ratio": 0.05,
-            "use_depth": False,
-        }
-    }
+    presets = {"paper": PRESETS["paper"]["edge_stack"]}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         from stages.edges.inputs import best_depth

@@ -20,6 +20,7 @@ from stages.artifacts import (
     RELATIVE,
     TERMINATORS,
 )
+from stages.edges.presets import PRESETS
 from workbench.stage import (
     Finding,
     Inputs,
@@ -187,9 +188,7 @@ class LinkedEdges(Stage):
             unit="px at 256²",
         )
 
-    presets = {
-        "paper": {"min_weight": 0.0, "use_evidence": False, "corners": 0.0, "use_depth": False}
-    }
+    presets = {"paper": PRESETS["paper"]["linked_edges"]}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         from stages.edges.inputs import best_depth

@@ -21,6 +21,7 @@ from stages.edges.depth_edges import RIDGE_REACH, DepthEdges, depth_edges
 from stages.edges.linking import Linked, Links, Reconstruction, Step, link, path_offset, reconstruct
 from stages.edges.operators import Gradient, gradient_of, non_maximum_suppression
 from stages.edges.planes import Camera
+from stages.edges.presets import PRESETS
 from stages.edges.regions import closed_regions, distance_to_border
 from stages.edges.stack import EdgeStack, build_stack, image_scale, noise_model
 from stages.edges.walls import Walls, upright_walls
@@ -30,20 +31,6 @@ __all__ = ["PRESETS", "LinkedResult", "StackResult", "link_edges", "segment", "s
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 Bool = NDArray[np.bool_]
-
-PRESETS: dict[str, dict[str, dict[str, Any]]] = {
-    "paper": {
-        "edge_stack": {
-            "operator": "gef", "noise_units": False, "lowest": 1.0, "max_ratio": 0.05,
-            "use_depth": False,
-        },
-        "linked_edges": {
-            "min_weight": 0.0, "use_evidence": False, "corners": 0.0, "use_depth": False,
-        },
-        "region_features": {},
-    },
-    "default": {"edge_stack": {}, "linked_edges": {}, "region_features": {}},
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
