@@ -94,6 +94,14 @@ def test_a_cut_anywhere_leaves_every_whole_frame(tmp_path: Path, layout: str) ->
         assert "chunk_damaged" not in recording.defects.counts, recording.defects.lines()
 
 
+def test_a_cut_before_the_first_image_is_told_with_what_is_missing(tmp_path: Path) -> None:
+    data = write_scene(tmp_path / "whole.mcap", truth=False).read_bytes()
+    cut_file = tmp_path / "cut.mcap"
+    cut_file.write_bytes(data[:60])
+    with pytest.raises(RecordingError, match=r"an image topic for near.*truncated"):
+        Recording.open(cut_file).require(PAIR)
+
+
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_what_precedes_a_cut_within_a_chunk_is_read(tmp_path: Path, compression: str) -> None:
     shape = (128, 160)

@@ -126,9 +126,10 @@ class Recording:
             for channel in missing
         )
         images = ", ".join(sorted(self._image_topics())) or "none"
+        damage = "".join(f"; {defect.kind}: {defect.says}" for defect in self._found)
         raise RecordingError(
             f"{self.path}: expected an image topic for {wanted}; image topics found: {images}; "
-            f"map one with --topic {missing[0]}=/some/topic"
+            f"map one with --topic {missing[0]}=/some/topic{damage}"
         )
 
     def topics(self) -> list[TopicInfo]:
