@@ -8,6 +8,7 @@ the SDK's own ``spawn`` and ``serve`` functions cannot be told.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import socket
 import subprocess
@@ -59,6 +60,8 @@ class Stream:
 
     recording: rr.RecordingStream
     web_url: str | None = None
+    trouble: str | None = None
+    """Why there is no viewer, where one was asked for and the run goes on without it."""
     child: subprocess.Popen[bytes] | None = field(default=None, repr=False)
 
     def wait_for_viewer(self) -> None:
@@ -89,8 +92,14 @@ def opened(destinations: Destinations, recording_id: str) -> Iterator[Stream]:
             sinks.append(_file_sink(file))
         if destinations.native or destinations.web:
             port = free_port()
-            stream.child, stream.web_url = _start_viewer(destinations, port)
-            sinks.append(rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy"))
+            try:
+                stream.child, stream.web_url = _start_viewer(destinations, port)
+                sinks.append(rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy"))
+            except DataError as error:
+                # A file that was asked for is not lost for want of a window.
+                if file is None:
+                    raise
+                stream.trouble = str(error)
         if sinks:
             recording.set_sinks(*sinks)
         try:
@@ -126,6 +135,12 @@ def _file_sink(path: Path) -> Any:
     except OSError as error:
         raise DataError(f"{path.with_suffix('')}: cannot be written: {error.strerror}") from error
     return rr.FileSink(str(path))
+
+
+def how_to_open(rrd: Path) -> str:
+    """The command that opens a saved replay, to be copied from the terminal."""
+    program = "rerun" if shutil.which("rerun") else rerun_program()
+    return f"{shlex.quote(program)} {shlex.quote(str(rrd))}"
 
 
 def rerun_program() -> str:
@@ -169,7 +184,10 @@ def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline:
         if child.poll() is not None:
-            raise DataError(f"the Rerun viewer ended at once (exit code {child.returncode})")
+            raise DataError(
+                f"the Rerun viewer ended at once (exit code {child.returncode}); where there is no "
+                "display that it can use, --save, --screenshot or --web show a replay"
+            )
         with suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=0.5):
             return
         time.sleep(0.05)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,12 +29,12 @@ def run(
     # Rerun is imported only now: a mistake in the flags or the recording is told at once.
     from workbench.bridge import Bridge
     from workbench.digest import digest_of
-    from workbench.viewer import Destinations, has_display, opened
+    from workbench.viewer import Destinations, has_display, how_to_open, opened
 
     native = not (web or save or screenshot)
     if native and not has_display():
         native, save = False, Path(f"{options.recording.stem}.rrd")
-        says = f"no display: saving {save} instead (open it with: rerun {shlex.quote(str(save))})"
+        says = f"no display: saving {save} instead (open it with: {how_to_open(save)})"
         err.print(says, soft_wrap=True, markup=False)
     elif save is not None and not web and screenshot is None and has_display():
         native = True
@@ -43,6 +42,8 @@ def run(
     identity = digest_of([str(session.provenance()), options.frames])
     report = RunReport(session)
     with opened(destinations, identity) as stream:
+        if stream.trouble is not None:
+            err.print(f"no viewer: {stream.trouble}", soft_wrap=True, markup=False)
         if stream.web_url is not None:
             err.print(f"open {stream.web_url}", soft_wrap=True, markup=False)
         bridge = Bridge(session, stream.recording)
