@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from stages.edges.score import (
     EdgeScore,
     FaceScore,
@@ -91,4 +93,7 @@ class RegionScorer(Scorer):
 def _has_faces(truth: Any, artifact: str, artifacts: Mapping[str, Any]) -> bool:
     if truth.instances is None or truth.faces is None or truth.meta.get("kind") == "grid":
         return False
-    return bool(truth.instances.shape == artifacts[artifact].shape)
+    if truth.instances.shape != artifacts[artifact].shape:
+        return False
+    # A bare plane has no boundary to find.
+    return bool(truth.instances.any() and np.ptp(face_ids(truth.instances, truth.faces)) > 0)
