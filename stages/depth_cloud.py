@@ -190,8 +190,15 @@ class DepthCloud(Stage):
         else:
             depth_m = calibration.z_m(relative)
         camera = inputs["near_camera"]
+        height, width = depth_m.shape
         if calibration is not None and camera is None:
             warnings.append("no camera calibration in the recording: no point cloud")
+        elif camera is not None and (camera.width, camera.height) != (width, height):
+            warnings.append(
+                f"the camera calibration is for {camera.width}×{camera.height} pixels, the images "
+                f"are {width}×{height}: no point cloud"
+            )
+            camera = None
         if calibration is None or camera is None:
             points = normals = np.zeros((0, 3), np.float32)
             shade = np.zeros(0, np.float32)

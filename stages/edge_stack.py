@@ -159,7 +159,7 @@ class EdgeStackStage(Stage):
         )  # fmt: skip
         strength = stack.strength[stack.strength > 0]
         counts, edges = np.histogram(strength, bins=96, range=(0, float(stack.thresholds[-1])))
-        names = ("low res.", "medium res.", "high res. = low")
+        names = ("low", "medium", "high")
         highs = dict(zip(names, stack.high_thresholds, strict=True))
         log_chart(recording, "edge_stack/histogram", edges[:-1], np.log10(1 + counts), highs)
         ratio = np.nan_to_num(np.minimum(stack.ratio, 5 * logged.parameters.max_ratio), nan=0.0)
@@ -184,14 +184,14 @@ class EdgeStackStage(Stage):
         return [
             rrb.Vertical(
                 map_view("edge_stack/gradient", "gradient", shape),
-                chart_view("edge_stack/histogram", f"log histogram, thresholds ({unit})"),
-                chart_view("edge_stack/ratio", f"small / large over threshold ({unit})"),
+                chart_view("edge_stack/histogram", f"histogram ({unit})"),
+                chart_view("edge_stack/ratio", f"small/large ({unit})"),
                 name=self.name,
             ),
             rrb.Vertical(
-                rrb.Spatial2DView(origin="edge_stack/low", name="5a low resolution"),
-                rrb.Spatial2DView(origin="edge_stack/medium", name="5b medium resolution"),
-                rrb.Spatial2DView(origin="edge_stack/high", name="5c high resolution"),
+                rrb.Spatial2DView(origin="edge_stack/low", name="5a low"),
+                rrb.Spatial2DView(origin="edge_stack/medium", name="5b medium"),
+                rrb.Spatial2DView(origin="edge_stack/high", name="5c high"),
                 name="the stack",
             ),
         ]

@@ -120,7 +120,7 @@ class RegionFeatures(Stage):
                 rrb.Spatial2DView(
                     origin="region_features",
                     contents=["region_features/intensity", "region_features/labels"],
-                    name="closed regions (hover for features)",
+                    name="regions (hover)",
                 ),
                 rrb.TextDocumentView(origin="region_features/table", name="regions by area"),
                 name=self.name,
@@ -179,15 +179,15 @@ def describe(row: Any) -> str:
 def table_page(regions: Any) -> str:
     """The regions that are not background as a markdown table, the largest first."""
     lines = [
-        "| # | area px | perimeter px | shape | reach px | elevation mm | tilt ° | residual mm |",
+        "| # | area px | up mm | tilt ° | perimeter px | shape | reach px | residual mm |",
         "|---|---|---|---|---|---|---|---|",
     ]
     parts = regions[~regions["background"]]
     lines += [
-        f"| {row['label']} | {row['area_px']} | {row['perimeter_px']:.1f} "
-        f"| {row['shape_factor']:.3f} | {row['greatest_distance_px']:.1f} "
+        f"| {row['label']} | {row['area_px']} "
         f"| {1e3 * row['elevation_m']:.1f} | {row['tilt_deg']:.1f} "
-        f"| {1e3 * row['residual_m']:.2f} |"
+        f"| {row['perimeter_px']:.1f} | {row['shape_factor']:.3f} "
+        f"| {row['greatest_distance_px']:.1f} | {1e3 * row['residual_m']:.2f} |"
         for row in parts[parts["area_px"].argsort(kind="stable")[::-1]]
     ]
     return "\n".join(lines)

@@ -83,7 +83,7 @@ class Registration(Stage):
         from stages.dfd.stripes import average_over_period, measure_stripes
 
         near_raw, far_raw = inputs["near_image"], inputs["far_image"]
-        if near_raw.shape != far_raw.shape:
+        if near_raw.shape[:2] != far_raw.shape[:2]:
             raise StageError(
                 f"near is {_size(near_raw)} and far is {_size(far_raw)}; they must be alike"
             )
@@ -108,6 +108,17 @@ class Registration(Stage):
             similarity = refine_similarity([(near, far)], similarity)
         flat = inputs["flat_image"]
         top = full_scale(*(image for image in (near_raw, far_raw, flat) if image is not None))
+        if calibration is not None and np.isfinite(top):
+            if top == calibration.full_scale or (
+                near_raw.dtype != np.uint8 and top < calibration.full_scale
+            ):
+                # The calibration has seen more of the camera than one frame shows.
+                top = calibration.full_scale
+            else:
+                warnings.append(
+                    f"the calibration was made with a full scale of {calibration.full_scale:g}, "
+                    f"the images have {top:g}: noise and confidence will be off"
+                )
         limit = parameters.saturation_percent / 100 * top
         saturated = (near >= limit) | ~np.isfinite(near)
         far_saturated = (far >= limit) | ~np.isfinite(far)

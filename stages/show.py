@@ -21,7 +21,7 @@ _SHADOW_COLOUR = (95, 95, 105)
 _CHART_WIDTH, _CHART_HEIGHT = 100.0, 60.0
 _TICK_COLOUR = (90, 150, 215)  # readable on the labels of the dark and of the light theme
 _BAR_STEPS = 64
-_BAR_ROOM = 1.3
+_BAR_ROOM = 1.42
 Colours = Literal["turbo", "magma", "viridis"]
 _OPENCV_MAPS = {
     "turbo": cv2.COLORMAP_TURBO,
@@ -132,7 +132,7 @@ def _log_bar_strips(
     recording.log(
         f"{path}/bar/ticks",
         rr.Points2D(
-            [(left + width * 0.13, y) for y in (0.02 * height, 0.47 * height, 0.91 * height)],
+            [(left + width * 0.2, y) for y in (0.0, 0.45 * height, 0.86 * height)],
             labels=[high, middle, low],
             colors=[_TICK_COLOUR] * 3,
             radii=0.05,

@@ -6,7 +6,8 @@ defects, parameters with provenance, and the pipeline as a graph.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,22 @@ _SOURCE = (90, 130, 200)
 _CHAPTER_SHARE = 2.4
 
 
+class _PathKeeper:
+    """A recording stream that remembers which entities were logged over time."""
+
+    def __init__(self, recording: rr.RecordingStream) -> None:
+        self._recording = recording
+        self.paths: set[str] = set()
+
+    def log(self, path: str, *entities: Any, static: bool = False, **options: Any) -> None:
+        if not static:
+            self.paths.add(path)
+        self._recording.log(path, *entities, static=static, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._recording, name)
+
+
 class Bridge:
     """Logs the runs of one session to a recording stream."""
 
@@ -36,36 +53,62 @@ class Bridge:
         self.recording = recording
         self._defects_told = -1
         self._laid_out: set[str] = set()
+        self._named_scores: set[str] = set()
+        self._paths: dict[str, set[str]] = {}
 
     def log(self, run: Run, report: RunReport, scores: Mapping[str, float]) -> None:
         """One run: inputs, every stage's pictures, and the bench's own numbers."""
         recording, frame = self.recording, run.frame
         recording.set_time(FRAME_TIMELINE, sequence=frame.index)
         recording.set_time(STAMP_TIMELINE, timestamp=np.datetime64(frame.stamp_ns, "ns"))
-        for channel, image in frame.images.items():
-            recording.log(f"recorded/{channel}", rr.Image(image))
+        with self._replacing("recorded") as kept:
+            for channel, image in frame.images.items():
+                kept.log(f"recorded/{channel}", rr.Image(image))
         broken = {failure.stage: failure.says for failure in run.failures}
         for stage in self.session.pipeline.stages:
-            if stage.name in broken:
-                continue
-            try:
-                stage.log(recording, self._logged(run, stage.name))
-            except Exception as error:
-                broken[stage.name] = f"its pictures: {one_line(error)}"
-                report.fail(stage.name, broken[stage.name])
+            with self._replacing(stage.name) as kept:
+                if stage.name in broken:
+                    continue
+                try:
+                    stage.log(kept, self._logged(run, stage.name))
+                except Exception as error:
+                    broken[stage.name] = f"its pictures: {one_line(error)}"
+                    report.fail(stage.name, broken[stage.name])
         for name, milliseconds in run.stage_ms.items():
             recording.log(f"bench/times/{name}", rr.Scalars(milliseconds))
         for name, value in scores.items():
             recording.log(f"bench/scores/{name}", rr.Scalars(value))
         self._log_defects(report, broken)
         self._log_graph(run, broken)
-        shown = {stage.name for stage in self.session.pipeline.stages} - set(broken)
         if not self._laid_out:
-            self._log_once(scores)
-        if not self._laid_out >= shown | {"bench"}:
-            # The first frame, or the first on which a stage that failed before came through.
-            self._laid_out |= shown | {"bench"}
-            recording.send_blueprint(self.blueprint(run, bool(scores), broken, report))
+            self._log_once()
+        for name in scores.keys() - self._named_scores:
+            self._named_scores.add(name)
+            series = rr.SeriesLines(names=name.split("/")[-1])
+            recording.log(f"bench/scores/{name}", series, static=True)
+        shown = {stage.name for stage in self.session.pipeline.stages} - set(broken)
+        shown |= {f"recorded {channel}" for channel in frame.images} | {"bench"}
+        shown |= ({"scores"} if scores else set()) | ({"truth"} if frame.truth else set())
+        if not self._laid_out >= shown:
+            # The first frame, or the first on which something came that was not there before.
+            self._laid_out |= shown
+            scored = "scores" in self._laid_out
+            recording.send_blueprint(self.blueprint(run, scored, broken, report))
+
+    @contextmanager
+    def _replacing(self, owner: str) -> Iterator[_PathKeeper]:
+        """Log for ``owner``; what it logged on an earlier frame and not on this one is cleared.
+
+        Rerun shows the latest of each entity: without this, the pictures of an earlier frame
+        would stand beside this one's as if they were its own.
+        """
+        keeper = _PathKeeper(self.recording)
+        try:
+            yield keeper
+        finally:
+            for path in sorted(self._paths.get(owner, set()) - keeper.paths):
+                self.recording.log(path, rr.Clear(recursive=False))
+            self._paths[owner] = keeper.paths
 
     def close(self, report: RunReport) -> None:
         """What is known only at the end: the recording's defects in full, and how it pairs."""
@@ -78,16 +121,12 @@ class Bridge:
 
     # -- the bench's own entities -----------------------------------------------------------------
 
-    def _log_once(self, scores: Mapping[str, float]) -> None:
+    def _log_once(self) -> None:
         for stage in self.session.pipeline.stages:
             self.recording.log(
                 f"bench/times/{stage.name}",
                 rr.SeriesLines(names=f"{stage.name} ms"),
                 static=True,
-            )
-        for name in scores:
-            self.recording.log(
-                f"bench/scores/{name}", rr.SeriesLines(names=name.split("/")[-1]), static=True
             )
         self.recording.log(
             "bench/parameters",

@@ -108,11 +108,16 @@ def scores_beside(scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> None:
                 figure,
                 *(_with_coverage(found.get(preset)) for preset in scores),
                 unit,
-                next(iter(found.values())).note,
+                _shared_note(found),
             )
             for (stage, figure, unit), found in rows.items()
         ),
     )
+
+
+def _shared_note(found: Mapping[str, Score]) -> str:
+    notes = {score.note for score in found.values()}
+    return notes.pop() if len(notes) == 1 else ""
 
 
 def _with_coverage(score: Score | None) -> str:

@@ -6,7 +6,7 @@ import time
 import warnings as python_warnings
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -227,13 +227,14 @@ class Pipeline:
         if set(outputs) != expected:
             raise StageError(f"gave {sorted(outputs)} where it declares {sorted(expected)}")
         sizes: dict[str, int] = {}
+        seen: set[int] = set()
         size = 0
         for artifact in stage.gives:
             value = outputs[artifact.name]
             artifact.check(value, sizes)
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
-                size += value.nbytes
+            size += _bytes_of(value, seen)
         return _Result(MappingProxyType(outputs), tuple(says), milliseconds, size)
 
 
@@ -295,6 +296,22 @@ def dependencies(stages: Iterable[Stage]) -> list[tuple[str, str, str]]:
     ]
 
 
+def _bytes_of(value: Any, seen: set[int]) -> int:
+    """Bytes of the arrays that a value holds, through dataclasses and containers, each once."""
+    if id(value) in seen:
+        return 0
+    seen.add(id(value))
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, Mapping):
+        return sum(_bytes_of(item, seen) for item in value.values())
+    if isinstance(value, list | tuple):
+        return sum(_bytes_of(item, seen) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return sum(_bytes_of(getattr(value, f.name), seen) for f in fields(value))
+    return 0
+
+
 def _load(need: Resource, path: Path) -> tuple[Any, str]:
     assert need.load is not None
     try:
@@ -309,4 +326,4 @@ def _lacking(stage: Stage, lacking: Sequence[str], failed: Mapping[str, str]) ->
     culprit = next((failed[name] for name in lacking if name in failed), None)
     if culprit is not None:
         return Failure(stage.name, f"not run: {culprit} failed", blocked_by=culprit)
-    return Failure(stage.name, f"not run: the recording has no {', '.join(lacking)}")
+    return Failure(stage.name, f"not run: there is no {', '.join(lacking)}")

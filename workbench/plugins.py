@@ -41,6 +41,12 @@ def find_stages(files: Sequence[Path] = ()) -> dict[str, Stage]:
             and value is not Stage
             and value.__module__ == module.__name__
         ]
+        # A class that others here derive from is their common base, not a stage of its own.
+        found_here = [
+            cls
+            for cls in found_here
+            if not any(other is not cls and issubclass(other, cls) for other in found_here)
+        ]
         if not found_here:
             raise StageError(f"--plugin {path}: no class derived from workbench.Stage in it")
         _add(stages, found_here, f"--plugin {path}")

@@ -19,6 +19,7 @@ from workbench.stage import Score, Scorer
 
 _KEPT_TIMES = 4096
 _KEPT_MESSAGES = 20
+_MORE = "and other messages of this kind"
 
 
 @dataclass
@@ -73,10 +74,21 @@ class RunReport:
         """Count a failure of a stage outside its computation."""
         self._count(self.failures, (stage, says))
 
+    def take_failures(self, other: RunReport, of: str) -> None:
+        """Add what failed and what was warned of in another run of the same frames."""
+        for (stage, says), count in other.failures.items():
+            if (stage, says) not in self.failures:
+                self.failures[(stage, f"{of}: {says}")] += count
+        for says, count in other.warnings.items():
+            if says not in self.warnings:
+                self.warnings[f"{of}: {says}"] += count
+
     @staticmethod
     def _count(counter: Counter[Any], key: Any) -> None:
-        if key in counter or len(counter) < _KEPT_MESSAGES:
-            counter[key] += 1
+        """Count a message; beyond a bounded number of different ones, only that there are more."""
+        if key not in counter and len(counter) >= _KEPT_MESSAGES:
+            key = (key[0], _MORE) if isinstance(key, tuple) else _MORE
+        counter[key] += 1
 
     def scores(self) -> dict[str, list[Score]]:
         """The figures of every stage that can be scored and had truth to be scored against."""

@@ -85,6 +85,13 @@ class Session:
         return {
             "bench": bench_version(),
             "recording": {"name": self.recording.path.name, "digest": self.recording.digest},
+            "topics": {
+                channel: topic
+                for channel, topic in sorted(self.recording.channel_topics.items())
+                if channel in (*pipeline.channels[0], *pipeline.channels[1])
+            },
+            "frames": list(self.options.frames),
+            "until": self.options.until,
             "resources": {
                 name: {"name": pipeline.resource_paths[name].name, "digest": digest}
                 for name, (_, digest) in pipeline.resources.items()

@@ -52,6 +52,7 @@ class Calibration:
     ``gain`` [6] float64: light of a white scene on the near sensor over that on the far one, as
     coefficients of 1, x, y, x², xy, y² with x and y from -1 to 1 over the image; vignetting is
     not the same on both.
+    ``full_scale``: grey level at which the sensors saturate; noise is in the same grey levels.
     ``report``: what the procedure measured, for people; plain JSON values.
     """
 
@@ -64,6 +65,7 @@ class Calibration:
     modulation: np.ndarray
     noise: SensorNoise
     gain: np.ndarray
+    full_scale: float
     report: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -99,6 +101,7 @@ class Calibration:
             "modulation": self.modulation.astype(np.float32, copy=False),
             "noise": np.array([self.noise.read_variance, self.noise.gain]),
             "gain": self.gain,
+            "full_scale": np.array([self.full_scale]),
             "report": np.array(json.dumps(self.report, sort_keys=True)),
         }
         with replacing(path) as beside, beside.open("wb") as file:
@@ -109,6 +112,9 @@ class Calibration:
         """Read a file that :meth:`save` wrote.  Raises ``OSError``, or ``ValueError`` in a line."""
         try:
             with path.open("rb") as raw:
+                if raw.read(2) != b"PK":
+                    raise ValueError(f"expected a {FORMAT} file (.npz), found something else")
+                raw.seek(0)
                 file = np.load(raw, allow_pickle=False)
                 return _from_arrays({name: file[name] for name in file.files})
         except (
@@ -153,6 +159,7 @@ def _from_arrays(arrays: dict[str, np.ndarray]) -> Calibration:
         arrays["modulation"].astype(np.float32, copy=False),
         SensorNoise(*_numbers(arrays, "noise", 2)),
         np.array(_numbers(arrays, "gain", 6)),
+        _numbers(arrays, "full_scale", 1)[0],
         json.loads(str(arrays["report"])),
     )
 

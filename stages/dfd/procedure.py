@@ -82,7 +82,7 @@ class CalibrateParameters(StageParameters):
 
 @dataclass(frozen=True)
 class _Plane:
-    """What is remembered of one calibration frame: known inverse depth, and its middle's ratio."""
+    """What is remembered of one calibration frame: its distance, and its middle's ratio."""
 
     index: int
     z_m: float
@@ -120,6 +120,7 @@ def calibrate(
     stripes = _stripes(frames, similarity)
     gain, gain_map, gain_spread = _gain(frames, similarity)
     noise, noise_source = _noise(frames, stripes)
+    scale = _full_scale(frames)
     side = stripes.extent_px()
     taps = whole_period_taps(side)
     windows = windows_for(side, parameters.smoothing_periods, 1.0)
@@ -175,8 +176,9 @@ def calibrate(
     progress("step 2: planes held back")
     span_m = far_z_m - near_z_m
     candidates = [parameters.degree] if parameters.degree else _DEGREES
-    tried = {d: _held_out(patches, d) for d in candidates if d <= highest} or {
-        highest: _held_out(patches, highest)
+    shared_px = parameters.neighbourhood_px
+    tried = {d: _held_out(patches, d, shared_px) for d in candidates if d <= highest} or {
+        highest: _held_out(patches, highest, shared_px)
     }
     best = min(rms for rms, _ in tried.values())
     # The lowest degree that is as good as the best one, for it extrapolates more calmly.
@@ -194,6 +196,7 @@ def calibrate(
         modulation,
         noise,
         gain,
+        scale,
     )
     progress("report")
     stand_off_mm = 500 * (near_z_m + far_z_m)
@@ -213,6 +216,7 @@ def calibrate(
         "noise_shot_gain": noise.gain,
         "noise_floor_grey_levels": math.sqrt(noise.read_variance),
         "noise_source": noise_source,
+        "full_scale": scale,
         "planes": len(planes),
         "planes_used": len(used),
         "distances": len(distances),
@@ -420,6 +424,19 @@ def _gain(frames: Frames, similarity: Similarity) -> tuple[np.ndarray, np.ndarra
     return gain, gain_map, 100 * float(np.std(drifts))
 
 
+def _full_scale(frames: Frames) -> float:
+    """The full scale that holds every plane: one frame of a 12-bit camera may look like 10 bits.
+
+    Of floating-point images the greatest level seen, for a file holds no infinity.
+    """
+    highest, levels = 0.0, 0.0
+    for frame, _ in _planes(frames):
+        images = [frame.images[channel] for channel in ("near", "far")]
+        highest = max(highest, full_scale(*images))
+        levels = max(levels, *(float(np.nanmax(image)) for image in images))
+    return highest if math.isfinite(highest) else levels
+
+
 class _PhotonTransfer:
     """Variance against grey level, gathered in bins."""
 
@@ -569,7 +586,7 @@ def _fit_modulation(points: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 # -- the report -----------------------------------------------------------------------------------
 
 
-def _held_out(patches: list[_Patch], degree: int) -> tuple[float, float]:
+def _held_out(patches: list[_Patch], degree: int, neighbourhood_px: int) -> tuple[float, float]:
     """Root mean square and worst error of relative depth on planes that the curve has not seen.
 
     In the middle 32×32.  Each distance between the first and the last is left out in turn (all
@@ -580,7 +597,8 @@ def _held_out(patches: list[_Patch], degree: int) -> tuple[float, float]:
         normal = _NormalEquations(degree)
         for patch in patches:
             if patch.z_m != left_out:
-                shared = cv2.blur(patch.ratio, (9, 9), borderType=cv2.BORDER_REFLECT_101)
+                size = (neighbourhood_px, neighbourhood_px)
+                shared = cv2.blur(patch.ratio, size, borderType=cv2.BORDER_REFLECT_101)
                 normal.add(shared, patch.target)
         curve = normal.solve()
         for patch in patches:

@@ -18,7 +18,12 @@ def best_depth(inputs: Mapping[str, Any]) -> tuple[np.ndarray | None, Camera | N
     neither.
     """
     depth_m, camera = inputs.get("depth_m"), inputs.get("near_camera")
-    if depth_m is not None and camera is not None and np.isfinite(depth_m).any():
+    if (
+        depth_m is not None
+        and camera is not None
+        and (camera.height, camera.width) == depth_m.shape
+        and np.isfinite(depth_m).any()
+    ):
         matrix = camera.K
         return depth_m, Camera(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     relative = inputs.get("depth_relative")

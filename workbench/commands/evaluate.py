@@ -31,12 +31,14 @@ def run(options: Options, as_json: bool) -> None:
             report.add(result)
             for name in others:
                 reports[name].add(sessions[name].pipeline.run(result.frame))
+    for name in others:
+        report.take_failures(reports[name], f"preset {name}")
     if as_json:
         scores = {name: other.as_dict()["scores"] for name, other in reports.items()}
         print(to_json(report.as_dict() | {"presets": scores}))
     else:
-        closing_tables(report, scores=False)
         scores_beside({name: other.scores() for name, other in reports.items()})
+        closing_tables(report, scores=False)
     if report.frames and not report.scores():
         lacking = (
             [] if "calibration" in report.session.pipeline.resources else ["no calibration given"]

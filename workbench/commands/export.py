@@ -11,20 +11,24 @@ import numpy as np
 from workbench.console import closing_tables, end, interruptible, out, tracked
 from workbench.errors import DataError, UsageError
 from workbench.files import replacing
-from workbench.pipeline import Run
+from workbench.pipeline import ResultStore, Run
 from workbench.report import RunReport, to_json, write_beside
 from workbench.session import Options, Session
 
 
 def run(options: Options, folder: Path, artifacts: str | None, as_json: bool) -> None:
     """Export; exits with 1 if a stage failed on any frame or there was no frame."""
-    session = Session.open(options)
+    # No result is asked for twice: none is kept.
+    session = Session.open(options, ResultStore(capacity_bytes=0))
     wanted = _wanted(session, artifacts)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"--to {folder}: {error.strerror}") from error
     report = RunReport(session)
+    # Frames of an earlier export would pass for this one's.
+    for stale in folder.glob("frame_*.npz"):
+        stale.unlink()
     write_beside(folder / "provenance.json", to_json(session.provenance()) + "\n")
     with (
         replacing(folder / "results.jsonl", keep_partial=True) as beside,
@@ -53,6 +57,7 @@ def result_line(run: Run) -> dict[str, Any]:
         "poses": run.artifacts.get("poses", []),
         "stage_ms": {name: round(ms, 3) for name, ms in run.stage_ms.items()},
         "warnings": [*run.warnings, *failures],
+        "failures": [{"stage": f.stage, "says": f.says} for f in run.failures],
     }
 
 

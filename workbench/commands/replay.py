@@ -6,8 +6,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from workbench.console import closing_tables, end, err, interruptible, out, tracked
-from workbench.errors import UsageError
+from workbench.errors import DataError, UsageError
 from workbench.files import check_output
+from workbench.pipeline import ResultStore
 from workbench.report import RunReport, to_json, write_beside
 from workbench.session import Options, Session
 
@@ -25,7 +26,8 @@ def run(
     for flag, path in (("--save", save), ("--screenshot", screenshot), ("--json", json_report)):
         if path is not None:
             check_output(flag, path)
-    session = Session.open(options)
+    # No result is asked for twice: none is kept.
+    session = Session.open(options, ResultStore(capacity_bytes=0))
     # Rerun is imported only now: a mistake in the flags or the recording is told at once.
     from workbench.bridge import Bridge
     from workbench.digest import digest_of
@@ -33,11 +35,15 @@ def run(
 
     native = not (web or save or screenshot)
     if native and not has_display():
-        native, save = False, Path(f"{options.recording.stem}.rrd")
+        native, save = False, _free_name(Path(f"{options.recording.stem}.rrd"))
+        check_output("--save", save)
         says = f"no display: saving {save} instead (open it with: {how_to_open(save)})"
         err.print(says, soft_wrap=True, markup=False)
     elif save is not None and not web and screenshot is None and has_display():
         native = True
+    total = session.count()
+    if total == 0:
+        raise DataError(f"{options.recording}: no frame in it, or in --frames")
     destinations = Destinations(native, web, save, screenshot, size)
     identity = digest_of([str(session.provenance()), options.frames])
     report = RunReport(session)
@@ -48,7 +54,7 @@ def run(
             err.print(f"open {stream.web_url}", soft_wrap=True, markup=False)
         bridge = Bridge(session, stream.recording)
         with interruptible(report):
-            for result in tracked(session.runs(), "replay", session.count()):
+            for result in tracked(session.runs(), "replay", total):
                 bridge.log(result, report, report.add(result))
         bridge.close(report)
         to_stdout = json_report is not None and str(json_report) == "-"
@@ -67,6 +73,15 @@ def run(
         if path is not None and path.exists() and not to_stdout:
             out.print(f"wrote {path}", soft_wrap=True, markup=False)
     end(report)
+
+
+def _free_name(path: Path) -> Path:
+    """``path``, or the first of NAME-2, NAME-3, … that is not there: nobody asked to replace it."""
+    number, free = 1, path
+    while free.exists():
+        number += 1
+        free = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return free
 
 
 def _window(text: str) -> tuple[int, int]:
