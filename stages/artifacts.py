@@ -28,6 +28,22 @@ CALIBRATION = Resource(
     filename="calibration.npz",
 )
 
+
+def _load_models(path: Path) -> Any:
+    from stages.matching.database import Database
+
+    return Database.load(path)
+
+
+MODELS = Resource(
+    "models",
+    doc="features and eigenspaces of the parts (sections 5 and 6)",
+    required=False,
+    load=_load_models,
+    make="stages.matching.procedure:Procedure",
+    filename="models.npz",
+)
+
 NEAR = Artifact("near", "float32", "H W", "grey levels", "near image")
 FAR = Artifact("far", "float32", "H W", "grey levels", "far image on the near image's grid")
 INTENSITY = Artifact(
@@ -75,5 +91,9 @@ LINKING = Artifact("linking", doc="each iteration of the reconstruction, and eve
 
 LABELS = Artifact("labels", "int32", "H W", "", "region of each pixel, 0 = none")
 REGIONS = Artifact("regions", doc="one row a region, a numpy structured array; see the stage")
+
+CANDIDATES = Artifact("candidates", doc="one row a candidate, a structured array; see the stage")
+VERDICT = Artifact("verdict", doc="pick or rearrange, region, object and reason; or None")
+POSES = Artifact("poses", doc="a list of plain objects, one for each picked surface; see the stage")
 
 CLOUD_INTENSITY = Artifact("cloud_intensity", "float32", "N", "grey levels", "brightness")

@@ -21,6 +21,7 @@ from workbench.recording import Frame, Recording
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "recordings" / "scene.mcap"
 CALIBRATION = SCENE.with_name("scene.calibration.npz")
+MODELS = SCENE.with_name("scene.models.npz")
 
 
 @dataclass(frozen=True)
@@ -144,12 +145,13 @@ def write_again(path: Path, frames: list[Frame], count: int, dialect: str = "pro
 
 @pytest.fixture(scope="session")
 def twins(tmp_path_factory: pytest.TempPathFactory, first_frames: list[Frame]) -> dict[str, Path]:
-    """Three frames of the committed recording in each dialect, with its calibration beside."""
+    """Three frames of the committed scene in each dialect, calibration and models beside."""
     made = {}
     for dialect in ("protobuf", "json", "ros2"):
         folder = tmp_path_factory.mktemp(dialect)
         made[dialect] = write_again(folder / "twin.mcap", first_frames, 3, dialect)
         (folder / "calibration.npz").write_bytes(CALIBRATION.read_bytes())
+        (folder / "models.npz").write_bytes(MODELS.read_bytes())
     return made
 
 

@@ -160,7 +160,8 @@ def test_a_changed_link_leaves_what_is_before_it_alone() -> None:
     frame = next(first.runs()).frame
     again = workbench.open(SCENE, set=["linked_edges.max_cost=9.0"])
     again.pipeline.store = first.pipeline.store
-    assert again.pipeline.run(frame).computed == {"linked_edges", "region_features"}
+    names = [stage.name for stage in again.pipeline.stages]
+    assert again.pipeline.run(frame).computed == set(names[names.index("linked_edges") :])
 
 
 @pytest.mark.parametrize("x", [0, 100, 255])
@@ -170,4 +171,4 @@ def test_every_stage_explains_a_pixel(runs: list[Run], x: int) -> None:
         parameters = session.pipeline.settings.parameters[stage.name]
         for finding in stage.explain(x, 128, runs[0].artifacts, parameters):
             assert finding.says
-            assert finding.parameter in stage.Parameters.model_fields
+            assert finding.parameter is None or finding.parameter in stage.Parameters.model_fields

@@ -28,6 +28,8 @@ STAGES = [
     "edge_stack",
     "linked_edges",
     "region_features",
+    "recognition",
+    "pose_frames",
 ]
 
 

@@ -245,6 +245,43 @@ def calibrate(
     )
 
 
+@app.command()
+def train(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(help="Recordings, each of one part lying flat.", metavar="REC…"),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],
+    calibration: Calibration = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="The part's name, once for each recording; else the ground truth's."),
+    ] = None,
+    angles: Annotated[
+        str | None,
+        typer.Option(help="Degrees of the frames, separated by commas; else the ground truth's."),
+    ] = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Train the database of parts: features of their surfaces, and eigenspaces."""
+    from workbench.commands import train as command
+
+    command.run(
+        recordings,
+        output,
+        calibration,
+        label or [],
+        angles,
+        assignments or [],
+        parse_topics(topic or []),
+        plugin or [],
+        as_json,
+    )
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
     interrupts.install()

@@ -1,0 +1,75 @@
+"""`workbench train` and the stages behind it, through the command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCENE = Path(__file__).parents[1] / "recordings" / "scene.mcap"
+CALIBRATION = SCENE.with_name("scene.calibration.npz")
+
+
+def workbench(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", "from workbench.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def one_line(done: subprocess.CompletedProcess[str], code: int) -> str:
+    assert done.returncode == code, done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+def test_a_recording_without_a_lone_part_is_one_line(tmp_path: Path) -> None:
+    done = workbench("train", SCENE, "--calibration", CALIBRATION, "-o", tmp_path / "m.npz")
+    assert "scene.mcap: frame 0: expected one part lying alone" in one_line(done, 1)
+    assert not (tmp_path / "m.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--label", "a", "--label", "b"], "--label: expected one for each recording (1), found 2"),
+        (["--angles", "0,x"], "--angles 0,x: expected degrees"),
+        (["--set", "train.sides=3"], "--set train.sides=3: expected one of"),
+        (["--set", "train.side=3"], "train.side"),
+    ],
+)
+def test_wrong_usage_is_one_line(tmp_path: Path, flags: list[str], says: str) -> None:
+    assert says in one_line(workbench("train", SCENE, "-o", tmp_path / "m.npz", *flags), 2)
+
+
+def test_without_models_there_is_no_verdict_and_no_failure(tmp_path: Path) -> None:
+    alone = tmp_path / "scene.mcap"
+    alone.write_bytes(SCENE.read_bytes())
+    done = workbench(
+        "export", alone, "--calibration", CALIBRATION, "--to", tmp_path / "out", "--frames", "0:1"
+    )
+    assert done.returncode == 0, done.stderr
+    line = json.loads((tmp_path / "out" / "results.jsonl").read_text().splitlines()[0])
+    assert line["verdict"] is None
+    assert line["poses"] == []
+
+
+@pytest.mark.skipif(
+    not SCENE.with_name("scene.models.npz").is_file(), reason="no models beside the scene"
+)
+def test_every_frame_of_the_scene_ends_in_a_verdict(tmp_path: Path) -> None:
+    done = workbench("export", SCENE, "--to", tmp_path / "out", "--artifacts", "candidates")
+    assert done.returncode == 0, done.stderr
+    for text in (tmp_path / "out" / "results.jsonl").read_text().splitlines():
+        line = json.loads(text)
+        assert line["verdict"]["verdict"] in ("pick", "rearrange")
+        assert line["verdict"]["reason"]
+        for pose in line["poses"]:
+            assert len(pose["camera_from_surface"]) == 4
+            assert pose["distance"] <= pose["zeta"]

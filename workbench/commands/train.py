@@ -1,0 +1,151 @@
+"""``workbench train``: runs the procedure that the pipeline's models name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pydantic
+
+from workbench.console import err, out, table
+from workbench.errors import DataError, UsageError
+from workbench.files import check_output
+from workbench.pipeline import ResultStore
+from workbench.plugins import find_stages
+from workbench.report import to_json
+from workbench.session import Options, Session
+from workbench.settings import value_from_text
+from workbench.stage import Resource, Stage, StageError
+
+RESOURCE = "models"
+
+
+def run(
+    paths: Sequence[Path],
+    output: Path,
+    calibration: Path | None,
+    labels: Sequence[str],
+    angles: str | None,
+    assignments: Sequence[str],
+    topics: Mapping[str, str],
+    plugins: Sequence[Path],
+    as_json: bool,
+) -> None:
+    """Train on the recordings, write the file and print its report."""
+    stages = find_stages(plugins)
+    procedure = _procedure(stages)
+    own = [a for a in assignments if a.startswith("train.")]
+    parameters = _parameters(procedure.Parameters, own)
+    if labels and len(labels) != len(paths):
+        raise UsageError(
+            f"--label: expected one for each recording ({len(paths)}), found {len(labels)}"
+        )
+    degrees = _angles(angles)
+    check_output("--output", output)
+    resources = {} if calibration is None else {procedure.resource: calibration}
+    store = ResultStore(capacity_bytes=1)
+    sessions = [
+        Session.open(
+            Options(
+                path,
+                resources,
+                assignments=[a for a in assignments if a not in own],
+                topics=topics,
+                until=procedure.until,
+                plugins=plugins,
+            ),
+            store,
+        )
+        for path in paths
+    ]
+    bound = _bound(sessions, procedure.resource)
+    with err.status("train") as status:
+        try:
+            made = procedure.run(
+                [
+                    (labels[k] if labels else None, degrees, session.runs())
+                    for k, session in enumerate(sessions)
+                ],
+                parameters,
+                bound,
+                progress=lambda says: status.update(f"train: {says}"),
+            )
+        except ValueError as error:
+            where = paths[0] if len(paths) == 1 else f"{len(paths)} recordings"
+            raise DataError(f"{where}: {error}") from error
+    made.report["recordings"] = [
+        {"name": path.name, "digest": session.recording.digest}
+        for path, session in zip(paths, sessions, strict=True)
+    ]
+    made.save(output)
+    if as_json:
+        print(to_json(made.report))
+        return
+    table("Models", ("quantity", "value"), list(_rows(made.report)))
+    out.print(f"wrote {output}", soft_wrap=True, markup=False)
+
+
+def _bound(sessions: Sequence[Session], name: str) -> Any:
+    """The one resource that all recordings were run with, or None.  Raises where they differ."""
+    found = [session.pipeline.resources.get(name) for session in sessions]
+    digests = {None if one is None else one[1] for one in found}
+    if len(digests) > 1:
+        raise UsageError(
+            f"expected one {name} for all recordings, found {len(digests)}; give --{name}"
+        )
+    return None if found[0] is None else found[0][0]
+
+
+def _angles(text: str | None) -> list[float] | None:
+    """``A:STEP`` is not guessed: a list of degrees, one for each frame, separated by commas."""
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",") if part.strip()]
+    except ValueError as error:
+        raise UsageError(f"--angles {text}: expected degrees separated by commas") from error
+
+
+def _procedure(stages: Mapping[str, Stage]) -> Any:
+    for stage in stages.values():
+        for need in stage.needs:
+            if isinstance(need, Resource) and need.name == RESOURCE and need.make:
+                module, _, name = need.make.partition(":")
+                return getattr(import_module(module), name)
+    raise StageError("no stage says how its models are made")
+
+
+def _parameters(model: type[pydantic.BaseModel], assignments: Sequence[str]) -> pydantic.BaseModel:
+    values = {}
+    for assignment in assignments:
+        address, equals, text = assignment.partition("=")
+        name = address.removeprefix("train.").strip()
+        if not equals or name not in model.model_fields:
+            raise UsageError(
+                f"--set {assignment}: expected one of "
+                + ", ".join(f"train.{field}=…" for field in model.model_fields)
+            )
+        values[name] = value_from_text(text.strip())
+    try:
+        return model(**values)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(["train", *(str(part) for part in first["loc"])])
+        raise UsageError(f"{where}: {first['msg']}, got {first['input']!r}") from error
+
+
+def _rows(report: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in report.items():
+        name = f"{prefix}{key}".replace("_", " ")
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{key} ")
+        elif isinstance(value, list):
+            yield name, ", ".join(
+                f"{v:.5g}" if isinstance(v, float)
+                else str(v["name"]) if isinstance(v, Mapping) else str(v)
+                for v in value
+            )  # fmt: skip
+        else:
+            yield name, f"{value:.5g}" if isinstance(value, float) else str(value)
