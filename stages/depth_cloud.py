@@ -287,7 +287,7 @@ class DepthCloud(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import DARK, map_view
+        from stages.show import DARK, eye_above, map_view
 
         shape = logged.artifacts["depth_m"].shape
         calibrated = logged.artifacts.get("calibration") is not None
@@ -310,7 +310,7 @@ class DepthCloud(Stage):
                 rrb.Spatial3DView(
                     origin="world",
                     name="cloud, camera_optical_frame",
-                    eye_controls=_eye(points),
+                    eye_controls=eye_above(points),
                     background=DARK,
                 )
             )
@@ -341,19 +341,3 @@ def _frustum_m(points: Any) -> float:
     import numpy as np
 
     return 0.86 * float(np.percentile(points[:, 2], 1)) if len(points) else 0.1
-
-
-def _eye(points: Any) -> Any:
-    """Looks from the side, with the camera above and the cloud below, as the rig stands."""
-    import numpy as np
-    import rerun.blueprint as rrb
-
-    low, high = np.percentile(points, [2, 98], axis=0)
-    middle = (low + high) / 2
-    size = float(np.linalg.norm(high - low))
-    target = middle - np.array([0, 0, 0.2 * size])
-    return rrb.EyeControls3D(
-        position=target + size * np.array([0.5, 1.25, -0.75]),
-        look_target=target,
-        eye_up=(0, 0, -1),
-    )

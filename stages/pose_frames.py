@@ -146,7 +146,9 @@ class PoseFrames(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import DARK
+        from stages.show import DARK, eye_above
+
+        points = logged.artifacts["cloud_xyz_m"]
 
         return [
             rrb.Spatial2DView(
@@ -154,7 +156,12 @@ class PoseFrames(Stage):
                 contents=[f"{PATH}/intensity", f"{PATH}/image/**"],
                 name="pose (x red, y green, z blue)",
             ),
-            rrb.Spatial3DView(origin=f"{PATH}/space", name="pose in space", background=DARK),
+            rrb.Spatial3DView(
+                origin=f"{PATH}/space",
+                name="pose in space",
+                background=DARK,
+                eye_controls=eye_above(points) if len(points) else None,
+            ),
             rrb.TextDocumentView(origin=f"{PATH}/text", name="pose and grasp"),
         ]
 

@@ -233,3 +233,16 @@ def chart_view(path: str, name: str) -> Any:
             y_range=(-0.05 * _CHART_HEIGHT, 1.3 * _CHART_HEIGHT),
         ),
     )
+
+
+def eye_above(points: np.ndarray) -> Any:
+    """An eye that sees points [N 3] from the side, with the camera above, as the rig stands."""
+    low, high = np.percentile(points, [2, 98], axis=0)
+    middle = (low + high) / 2
+    size = float(np.linalg.norm(high - low))
+    target = middle - np.array([0, 0, 0.2 * size])
+    return rrb.EyeControls3D(
+        position=target + size * np.array([0.5, 1.25, -0.75]),
+        look_target=target,
+        eye_up=(0, 0, -1),
+    )
