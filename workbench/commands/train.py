@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from importlib import import_module
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import pydantic
 
 from workbench.console import err, out, table
 from workbench.errors import DataError, UsageError
 from workbench.files import check_output
 from workbench.pipeline import ResultStore
 from workbench.plugins import find_stages
+from workbench.procedures import parameters_of, procedure_of, report_rows
 from workbench.report import to_json
 from workbench.session import Options, Session
-from workbench.settings import value_from_text
-from workbench.stage import Resource, Stage, StageError
 
 RESOURCE = "models"
 
@@ -35,9 +31,9 @@ def run(
 ) -> None:
     """Train on the recordings, write the file and print its report."""
     stages = find_stages(plugins)
-    procedure = _procedure(stages)
+    procedure = procedure_of(stages, RESOURCE)
     own = [a for a in assignments if a.startswith("train.")]
-    parameters = _parameters(procedure.Parameters, own)
+    parameters = parameters_of(procedure.Parameters, "train", own)
     if labels and len(labels) != len(paths):
         raise UsageError(
             f"--label: expected one for each recording ({len(paths)}), found {len(labels)}"
@@ -83,7 +79,7 @@ def run(
     if as_json:
         print(to_json(made.report))
         return
-    table("Models", ("quantity", "value"), list(_rows(made.report)))
+    table("Models", ("quantity", "value"), report_rows(made.report))
     out.print(f"wrote {output}", soft_wrap=True, markup=False)
 
 
@@ -106,46 +102,3 @@ def _angles(text: str | None) -> list[float] | None:
         return [float(part) for part in text.split(",") if part.strip()]
     except ValueError as error:
         raise UsageError(f"--angles {text}: expected degrees separated by commas") from error
-
-
-def _procedure(stages: Mapping[str, Stage]) -> Any:
-    for stage in stages.values():
-        for need in stage.needs:
-            if isinstance(need, Resource) and need.name == RESOURCE and need.make:
-                module, _, name = need.make.partition(":")
-                return getattr(import_module(module), name)
-    raise StageError("no stage says how its models are made")
-
-
-def _parameters(model: type[pydantic.BaseModel], assignments: Sequence[str]) -> pydantic.BaseModel:
-    values = {}
-    for assignment in assignments:
-        address, equals, text = assignment.partition("=")
-        name = address.removeprefix("train.").strip()
-        if not equals or name not in model.model_fields:
-            raise UsageError(
-                f"--set {assignment}: expected one of "
-                + ", ".join(f"train.{field}=…" for field in model.model_fields)
-            )
-        values[name] = value_from_text(text.strip())
-    try:
-        return model(**values)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(["train", *(str(part) for part in first["loc"])])
-        raise UsageError(f"{where}: {first['msg']}, got {first['input']!r}") from error
-
-
-def _rows(report: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in report.items():
-        name = f"{prefix}{key}".replace("_", " ")
-        if isinstance(value, Mapping):
-            yield from _rows(value, f"{key} ")
-        elif isinstance(value, list):
-            yield name, ", ".join(
-                f"{v:.5g}" if isinstance(v, float)
-                else str(v["name"]) if isinstance(v, Mapping) else str(v)
-                for v in value
-            )  # fmt: skip
-        else:
-            yield name, f"{value:.5g}" if isinstance(value, float) else str(value)
