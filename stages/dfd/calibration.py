@@ -6,8 +6,6 @@ The file is a plain ``.npz`` of arrays with a format name and version; nothing i
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stages.arrays import read_arrays
 from stages.dfd.focus import LaplacianKind, SensorNoise
 from stages.dfd.similarity import Similarity
 from stages.dfd.stripes import Stripes
@@ -110,34 +109,13 @@ class Calibration:
     @staticmethod
     def load(path: Path) -> Calibration:
         """Read a file that :meth:`save` wrote.  Raises ``OSError``, or ``ValueError`` in a line."""
-        try:
-            with path.open("rb") as raw:
-                if raw.read(2) != b"PK":
-                    raise ValueError(f"expected a {FORMAT} file (.npz), found something else")
-                raw.seek(0)
-                file = np.load(raw, allow_pickle=False)
-                return _from_arrays({name: file[name] for name in file.files})
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            AttributeError,
-            KeyError,
-            TypeError,
-        ) as error:
-            raise ValueError(f"expected a {FORMAT} file: damaged or not one ({error})") from error
+        return read_arrays(
+            path, "calibration", FORMAT, VERSION, "workbench calibrate", _from_arrays
+        )
 
 
 def _from_arrays(arrays: dict[str, np.ndarray]) -> Calibration:
     """The calibration that a file's arrays hold.  Raises ``ValueError``, ``KeyError`` or so."""
-    if str(arrays.get("format")) != FORMAT:
-        raise ValueError(f"expected a {FORMAT} file, found arrays {', '.join(list(arrays)[:4])}")
-    version = str(arrays["version"])
-    if version != str(VERSION):
-        raise ValueError(
-            f"expected calibration version {VERSION}, found {version}; "
-            "run `workbench calibrate` again"
-        )
     width, height = (int(v) for v in _numbers(arrays, "size", 2))
     curve = arrays["curve"]
     if curve.ndim != 3 or curve.shape[1:] != (height, width) or not np.isfinite(curve).all():

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import warnings
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stages.arrays import read_arrays
 from stages.edges.planes import Plane
 from stages.matching.eigenspace import POINTS, Eigenspace, build, matches
 from stages.matching.surfaces import PROFILE_SECTORS, Surface, fall_off, features_mm, soft_view
@@ -183,30 +182,10 @@ class Database:
     @staticmethod
     def load(path: Path) -> Database:
         """Read a file that :meth:`save` wrote.  Raises ``OSError``, or ``ValueError`` in a line."""
-        try:
-            with path.open("rb") as raw:
-                file = np.load(raw, allow_pickle=False)
-                return _from_arrays({name: file[name] for name in file.files})
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            EOFError,
-            AttributeError,
-            KeyError,
-            IndexError,
-            TypeError,
-        ) as error:
-            raise ValueError(f"expected a {FORMAT} file: damaged or not one ({error})") from error
+        return read_arrays(path, "models", FORMAT, VERSION, "workbench train", _from_arrays)
 
 
 def _from_arrays(arrays: Mapping[str, np.ndarray]) -> Database:
-    if str(arrays.get("format")) != FORMAT:
-        raise ValueError(f"expected a {FORMAT} file, found arrays {', '.join(list(arrays)[:4])}")
-    version = str(arrays["version"])
-    if version != str(VERSION):
-        raise ValueError(
-            f"expected models version {VERSION}, found {version}; run `workbench train` again"
-        )
     side = int(arrays["image"][0])
     parts = []
     for k, name in enumerate(arrays["names"]):
