@@ -17,7 +17,7 @@ import pytest
 from workbench.digest import digest_of, digest_of_code
 from workbench.pipeline import Pipeline, ResultStore, Run, ordered
 from workbench.recording import Frame
-from workbench.settings import resolve
+from workbench.settings import adjusted, resolve
 from workbench.stage import (
     WARNINGS,
     Artifact,
@@ -200,6 +200,15 @@ def test_a_changed_parameter_reruns_only_what_is_downstream(turned: str, again_r
 @pytest.mark.parametrize("equal", ["A.offset=0", "A.offset=0.0", "A.offset=0e3"])
 def test_an_equal_parameter_reruns_nothing(equal: str) -> None:
     assert again(equal)[1].computed == set()
+
+
+def test_other_settings_on_the_same_pipeline_rerun_only_what_is_downstream() -> None:
+    one = pipeline(*FORK)
+    first = one.run(frame(1, far=2))
+    stages = {s.name: s for s in one.stages}
+    turned = one.with_settings(adjusted(stages, one.settings, {"C.offset": 3}))
+    assert turned.run(frame(1, far=2)).computed == set("CD")
+    assert one.run(frame(1, far=2)).artifacts["d"] is first.artifacts["d"]
 
 
 def test_turning_back_reruns_nothing() -> None:

@@ -9,7 +9,14 @@ from typing import Any, Literal
 import pytest
 
 from workbench.plugins import find_stages
-from workbench.settings import Settings, SettingsError, preset_names, resolve
+from workbench.settings import (
+    Settings,
+    SettingsError,
+    adjusted,
+    preset_names,
+    resolve,
+    to_toml,
+)
 from workbench.stage import Knob, Stage, StageParameters, knob
 
 
@@ -104,6 +111,34 @@ def test_what_changed_repeats_the_run(tmp_path: Path) -> None:
     tuned = resolve(STAGES, None, toml(tmp_path, TUNED), ["cut.level=0.9"])
     again = resolve(STAGES, tuned.preset, None, [f"{k}={v}" for k, v in tuned.changed.items()])
     assert flat(again) == flat(tuned) and again.changed == tuned.changed
+
+
+def test_adjusting_is_the_same_as_setting() -> None:
+    soft = resolve(STAGES, "soft")
+    turned = adjusted(STAGES, soft, {"blur.rounds": 3, "cut.level": 1})
+    assert turned == resolve(STAGES, "soft", assignments=["blur.rounds=3", "cut.level=1"])
+    assert adjusted(STAGES, turned, {"blur.rounds": 2, "cut.level": 0.25}) == soft
+
+
+@pytest.mark.parametrize(
+    ("address", "value"), [("blur.rounds", 7), ("blur.rounds", "3"), ("blur.no", 1), ("no.x", 1)]
+)
+def test_adjusting_refuses_what_setting_refuses(address: str, value: Any) -> None:
+    with pytest.raises(SettingsError, match=address.split(".")[0]):
+        adjusted(STAGES, resolve(STAGES), {address: value})
+
+
+@pytest.mark.parametrize("preset", ["default", "soft"])
+def test_a_written_configuration_reads_back_to_the_same_settings(
+    tmp_path: Path, preset: str
+) -> None:
+    settings = adjusted(
+        STAGES,
+        resolve(STAGES, preset),
+        {"blur.sigma": 0.1, "blur.label": 'a "quoted"\nname', "blur.wrap": True},
+    )
+    text = to_toml(settings, "dark parts", {"frames": [0, None], "until": None, "bench": "1"})
+    assert resolve(STAGES, None, toml(tmp_path, text)) == settings
 
 
 def test_parameters_are_frozen() -> None:

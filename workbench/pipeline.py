@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings as python_warnings
 from collections import OrderedDict
@@ -116,6 +117,12 @@ class Pipeline:
                 self.resources[need.name] = _load(need, path)
         self._code = {s.name: digest_of_code(type(s).__module__) for s in self.stages}
         self._warm: set[str] = set()
+
+    def with_settings(self, settings: Settings) -> Pipeline:
+        """The same stages and resources under other parameters, with results kept in common."""
+        other = copy.copy(self)
+        other.settings = settings
+        return other
 
     def sources(self, kind: type[S]) -> list[S]:
         """The needs of one kind that no stage gives, without doubles; required where any is."""

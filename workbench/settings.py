@@ -69,8 +69,7 @@ def resolve(
         raise SettingsError(
             f"no preset {preset!r}; presets: {', '.join(preset_names(stages.values()))}"
         )
-    base = {name: dict(stage.presets.get(preset, {})) for name, stage in stages.items()}
-    values = {name: dict(preset_values) for name, preset_values in base.items()}
+    values = {name: dict(stage.presets.get(preset, {})) for name, stage in stages.items()}
     for address, value in _flat(from_file.get("parameters", {}), config):
         stage_name, parameter = _address(address, stages, f"{config}")
         values[stage_name][parameter] = value
@@ -80,15 +79,66 @@ def resolve(
             raise SettingsError(f"--set {assignment}: expected stage.parameter=value")
         stage_name, parameter = _address(address.strip(), stages, f"--set {assignment}")
         values[stage_name][parameter] = value_from_text(text.strip())
+    return _settled(stages, preset, values)
+
+
+def adjusted(
+    stages: Mapping[str, Stage], settings: Settings, values: Mapping[str, Any]
+) -> Settings:
+    """``settings`` with other values at some addresses (``stage.parameter``).
+
+    Raises :class:`SettingsError` for an unknown address or a value that its knob refuses.
+    """
+    laid = settings.as_dict()
+    for address, value in values.items():
+        stage_name, parameter = _address(address, stages, address)
+        laid[stage_name][parameter] = value
+    return _settled(stages, settings.preset, laid)
+
+
+def _settled(
+    stages: Mapping[str, Stage], preset: str, values: Mapping[str, Mapping[str, Any]]
+) -> Settings:
     parameters = {name: _validate(stage, values[name]) for name, stage in stages.items()}
     changed: dict[str, Any] = {}
     for name, stage in stages.items():
-        unchanged = _validate(stage, base[name])
+        unchanged = _validate(stage, stage.presets.get(preset, {}))
         for key in type(unchanged).model_fields:
             value = getattr(parameters[name], key)
             if value != getattr(unchanged, key):
                 changed[f"{name}.{key}"] = value
     return Settings(preset, parameters, changed)
+
+
+def to_toml(
+    settings: Settings, reason: str = "", provenance: Mapping[str, Any] | None = None
+) -> str:
+    """A configuration that ``--config`` reads back to the same settings: what was changed, and why.
+
+    ``provenance`` is kept beside it for readers and ``compare``; nothing in it is None.
+    """
+    import tomli_w
+
+    tables: dict[str, dict[str, Any]] = {}
+    for address, value in settings.changed.items():
+        stage, _, parameter = address.partition(".")
+        tables.setdefault(stage, {})[parameter] = value
+    document: dict[str, Any] = {"preset": settings.preset}
+    if reason:
+        document["reason"] = reason
+    document["parameters"] = tables
+    if provenance:
+        document["provenance"] = _without_none(provenance)
+    return tomli_w.dumps(document)
+
+
+def _without_none(value: Any) -> Any:
+    """``value`` as TOML can hold it, which has no null."""
+    if isinstance(value, Mapping):
+        return {str(key): _without_none(item) for key, item in value.items() if item is not None}
+    if isinstance(value, list | tuple):
+        return [_without_none(item) for item in value if item is not None]
+    return value
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
