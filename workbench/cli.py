@@ -261,6 +261,12 @@ def train(
         str | None,
         typer.Option(help="Degrees of the frames, separated by commas; else the ground truth's."),
     ] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Keep pictures of what training found in this .rrd file.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of them; needs no screen.")
+    ] = None,
     assignments: Set = None,
     topic: Topic = None,
     plugin: Plugin = None,
@@ -278,6 +284,8 @@ def train(
         assignments or [],
         parse_topics(topic or []),
         plugin or [],
+        save,
+        screenshot,
         as_json,
     )
 

@@ -179,6 +179,13 @@ class Database:
         with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
+    def log(self, recording: Any) -> Any:
+        """Log what training found to a ``rerun.RecordingStream``; returns the layout for it."""
+        from stages.matching.report import blueprint, log_database
+
+        log_database(recording, self)
+        return blueprint(self)
+
     @staticmethod
     def load(path: Path) -> Database:
         """Read a file that :meth:`save` wrote.  Raises ``OSError``, or ``ValueError`` in a line."""
