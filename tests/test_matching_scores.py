@@ -118,5 +118,10 @@ def test_how_much_is_covered_is_told_from_what_is_seen(
     found = {name: score for name, score in scores.items() if name.startswith("recognised")}
     assert any(bin_ in name for name in found), found
     assert sum(int(score.note.split()[1]) for score in found.values()) == 2
+    # What shows is enough for a name, until a plate without its corner could be an ell.
+    assert all(
+        score.value == (bin_ != "10 to 20 %" or bin_ not in name) for name, score in found.items()
+    )
+    assert all("0 misnamed" in score.note for score in found.values())
     assert scores["wrong names"].value == 0
     assert scores["picked part uncovered and named rightly"].value == 1

@@ -126,13 +126,20 @@ def _from_training(object_rotation: F64, normal: F64) -> F64 | None:
     return None
 
 
+def _named(row: Any, database: Any) -> int:
+    """The model that a candidate was named after, picked or not; -1 for none."""
+    if row["distance"] <= database.phi:
+        return int(row["model"])
+    return int(row["visible_model"])
+
+
 class RecognitionScorer(Scorer):
     """Picks of uncovered parts, wrong names, and how recognition holds as occlusion grows.
 
     For the last, every part that lies as in training, tilted up to 25° at most, is looked up
     among the candidates: how much of its surface is covered is known from what is seen of it and
-    the area that training measured.  *Recognised* is a surface that is a candidate whose features
-    lie under φ of the right part, whether or not the bench would pick it.
+    the area that training measured.  *Recognised* is a surface that the right part's name was found
+    for, by its features under φ or by what shows of it, whether or not the bench would pick it.
     """
 
     def __init__(self) -> None:
@@ -181,8 +188,9 @@ class RecognitionScorer(Scorer):
             shown = np.bincount(artifacts["labels"][face.mask])
             candidates = artifacts["candidates"]
             row = candidates[candidates["label"] == shown.argmax()]
-            if shown.argmax() and len(row) and row["distance"][0] <= database.phi:
-                right = database.names[int(row["model"][0])] == name
+            model = _named(row[0], database) if shown.argmax() and len(row) else -1
+            if model >= 0:
+                right = database.names[model] == name
                 self.recognised[k] += right
                 self.misnamed[k] += not right
 
