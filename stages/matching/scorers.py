@@ -34,6 +34,10 @@ _SAME_FACE_DEG = 60.0
 """A face turned farther from how the part lay in training is another face."""
 
 
+_SAME_AREA = 1.1
+"""A face that is larger than this many times the trained one is the opposite face, and another."""
+
+
 def covered_px(instances: np.ndarray, depth_m: np.ndarray, own: int) -> int:
     """Pixels of an object's outline where another object is in front of it by over 1 mm."""
     count = 0
@@ -182,6 +186,8 @@ class RecognitionScorer(Scorer):
             if face is None:
                 continue
             whole = float(np.median(database.parts[database.names.index(name)].features[:, 0]))
+            if face.area_mm2 > _SAME_AREA * whole:
+                continue
             covered = float(np.clip(1 - face.area_mm2 / whole, 0, 1))
             k = int(np.searchsorted(_COVERED_BINS, covered, side="right"))
             self.surfaces[k] += 1
