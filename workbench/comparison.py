@@ -7,12 +7,11 @@ as two :class:`Side` and one :class:`~workbench.differences.Totals`.  No Rerun i
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from workbench.differences import Total, Totals
+from workbench.differences import Difference, Total, Totals
 from workbench.report import RunReport, finite
 from workbench.stage import Score, Stage
 
@@ -32,10 +31,8 @@ class Side:
     """Every parameter's value by its address, ``stage.parameter``."""
     digests: Mapping[str, str]
     """What it was made from: recording, resources, code of each stage, libraries."""
-    scores: dict[str, dict[int, float]] = field(default_factory=dict)
-    """``stage/name`` to frame to what that frame scored."""
-    times_ms: dict[str, list[float]] = field(default_factory=dict)
-    """Stage to the milliseconds of each frame."""
+    median_ms: Mapping[str, float] = field(default_factory=dict)
+    """Stage to the median of its milliseconds."""
     figures: Mapping[str, Sequence[Score]] = field(default_factory=dict)
     """What the stages' scorers sum up; only where they ran here."""
 
@@ -45,13 +42,6 @@ class Side:
         named = self.title in (preset, self.preset)
         changed = f", changed: {', '.join(self.changed)}" if self.changed else ""
         return (preset if named else f"{self.title}, {preset}") + changed
-
-    def take(self, frame: int, scores: Mapping[str, float], stage_ms: Mapping[str, float]) -> None:
-        """Take in the numbers of one frame."""
-        for name, value in scores.items():
-            self.scores.setdefault(name, {})[frame] = value
-        for stage, milliseconds in stage_ms.items():
-            self.times_ms.setdefault(stage, []).append(milliseconds)
 
 
 def side_of(title: str, provenance: Mapping[str, Any]) -> Side:
@@ -76,6 +66,15 @@ def side_of(title: str, provenance: Mapping[str, Any]) -> Side:
 
 
 @dataclass
+class _Scored:
+    """One figure over the frames on which both sides have it."""
+
+    frames: int = 0
+    sum_a: float = 0.0
+    sum_b: float = 0.0
+
+
+@dataclass
 class Comparison:
     """A and B, and how their results differ."""
 
@@ -89,6 +88,25 @@ class Comparison:
     """Frames that only A has."""
     only_b: Sequence[int] = ()
     interrupted: bool = False
+    _scored: dict[str, _Scored] = field(default_factory=dict, repr=False)
+
+    def take(
+        self,
+        frame: int,
+        differences: Mapping[str, Mapping[str, Difference]],
+        scores_a: Mapping[str, float],
+        scores_b: Mapping[str, float],
+    ) -> None:
+        """Take in one frame: what differs, and what each side scored (``stage/name``)."""
+        self.frames += 1
+        self.totals.add(frame, differences)
+        for name in _either(scores_a, scores_b):
+            scored = self._scored.setdefault(name, _Scored())
+            a, b = scores_a.get(name, math.nan), scores_b.get(name, math.nan)
+            if math.isfinite(a) and math.isfinite(b):
+                scored.frames += 1
+                scored.sum_a += a
+                scored.sum_b += b
 
     def parameters(self) -> list[dict[str, Any]]:
         """The parameters that differ; a value is None where a side does not have it."""
@@ -115,17 +133,16 @@ class Comparison:
     def scores(self) -> list[dict[str, Any]]:
         """The frames' own scores, in the mean over those frames that both scored."""
         rows = []
-        for name in _either(self.a.scores, self.b.scores):
-            a, b = self.a.scores.get(name, {}), self.b.scores.get(name, {})
-            shared = [f for f in a if f in b and math.isfinite(a[f]) and math.isfinite(b[f])]
-            mean_a = statistics.fmean(a[f] for f in shared) if shared else None
-            mean_b = statistics.fmean(b[f] for f in shared) if shared else None
+        for name in self._in_order(self._scored):
+            scored = self._scored[name]
+            mean_a = scored.sum_a / scored.frames if scored.frames else None
+            mean_b = scored.sum_b / scored.frames if scored.frames else None
             stage, _, figure = name.partition("/")
             rows.append(
                 {
                     "stage": stage,
                     "name": figure,
-                    "frames": len(shared),
+                    "frames": scored.frames,
                     "a": mean_a,
                     "b": mean_b,
                     "difference": _less(mean_b, mean_a),
@@ -162,11 +179,20 @@ class Comparison:
         return [
             {
                 "stage": stage,
-                "a_ms": _median(self.a.times_ms.get(stage)),
-                "b_ms": _median(self.b.times_ms.get(stage)),
+                "a_ms": self.a.median_ms.get(stage),
+                "b_ms": self.b.median_ms.get(stage),
             }
-            for stage in _either(self.a.times_ms, self.b.times_ms)
+            for stage in self._in_order(_either(self.a.median_ms, self.b.median_ms))
         ]
+
+    def _in_order(self, names: Iterable[str]) -> list[str]:
+        """Names that begin with a stage's, in the order of the stages and then of the names."""
+        order = {stage: place for place, stage in enumerate(self.totals.of)}
+
+        def place(name: str) -> tuple[int, str]:
+            return order.get(name.partition("/")[0], len(order)), name
+
+        return sorted(names, key=place)
 
     def remarks(self) -> list[str]:
         """What a reader should know before believing the rest."""
@@ -208,36 +234,47 @@ class Comparison:
         }
 
     def page(self, legend: str) -> str:
-        """The comparison as markdown, for the viewer."""
-        a, b = self.a, self.b
-        lines = [
-            f"**A** {a.described()}  ",
-            f"**B** {b.described()}  ",
-            f"{self.frames} frames",
-            *(f"\n**Note**: {says}" for says in self.remarks()),
-            "",
-            "## Parameters that differ",
-            *_markdown(
-                ("parameter", "A", "B", "unit"),
-                ([p["address"], told(p["a"]), told(p["b"]), p["unit"]] for p in self.parameters()),
-            ),
-            "## Results that differ",
-            *_markdown(RESULT_COLUMNS, map(result_row, self.totals.differing())),
-            f"Pictures: {legend}.",
-            "## Against ground truth",
-            *_markdown(("stage", "figure", "A", "B", "B − A", "unit"), self.score_rows()),
-            "## Stage times",
-            *_markdown(("stage", "A ms", "B ms"), self.time_rows()),
-            "## Made from",
-            *_markdown(
-                ("what", "A", "B"),
-                (
-                    [row["what"], told(row["a"]), "the same" if row["same"] else told(row["b"])]
-                    for row in self.digests()
+        """What differs, as markdown for the viewer."""
+        differing = self.totals.stages
+        same = [stage for stage in self.totals.of if stage not in differing]
+        return "\n".join(
+            [
+                f"**A** {self.a.described()}  ",
+                f"**B** {self.b.described()}  ",
+                f"{self.frames} frames. Stages that differ: {', '.join(differing) or 'none'}; "
+                f"that do not: {', '.join(same) or 'none'}.",
+                *(f"\n**Note**: {says}." for says in self.remarks()),
+                "",
+                "## Parameters that differ",
+                *_markdown(
+                    ("parameter", "A", "B", "unit"),
+                    (
+                        [row["address"], told(row["a"]), told(row["b"]), row["unit"]]
+                        for row in self.parameters()
+                    ),
                 ),
-            ),
-        ]
-        return "\n".join(lines)
+                "## Results that differ",
+                *_markdown(RESULT_COLUMNS, map(result_row, self.totals.differing())),
+                *([f"Pictures: {legend}."] if differing else []),
+            ]
+        )
+
+    def numbers_page(self) -> str:
+        """Scores, times and what both were made from, as markdown for the viewer."""
+        digests = (
+            [row["what"], told(row["a"]), "the same" if row["same"] else told(row["b"])]
+            for row in self.digests()
+        )
+        return "\n".join(
+            [
+                "## Against ground truth",
+                *_markdown(("stage", "figure", "A", "B", "B − A", "unit"), self.score_rows()),
+                "## Stage times, median",
+                *_markdown(("stage", "A ms", "B ms"), self.time_rows()),
+                "## Made from",
+                *_markdown(("what", "A", "B"), digests),
+            ]
+        )
 
     def score_rows(self) -> list[list[str]]:
         """Stage, figure, A, B, B minus A, unit: the summed-up figures, or the frames' means."""
@@ -248,7 +285,7 @@ class Comparison:
                 row["name"],
                 number(row["a"]) + _covered(row.get("coverage_a")),
                 number(row["b"]) + _covered(row.get("coverage_b")),
-                "" if row["difference"] is None else f"{row['difference']:+.3f}",
+                _change(row["difference"]),
                 row.get("unit", "mean of frames"),
             ]
             for row in rows
@@ -261,7 +298,7 @@ class Comparison:
         ]
 
 
-RESULT_COLUMNS = ("stage", "artifact", "frames #", "differs", "largest", "where")
+RESULT_COLUMNS = ("stage", "artifact", "frames", "differs", "largest", "where")
 
 
 def result_row(total: Total) -> list[str]:
@@ -300,7 +337,8 @@ def units_of(stages: Iterable[Stage]) -> dict[str, str]:
 
 
 def take_report(side: Side, report: RunReport) -> None:
-    """Keep what the scorers of a finished run sum up."""
+    """Keep what a finished run sums up: the stages' times and their scorers' figures."""
+    side.median_ms = {stage: report.median_ms(stage) for stage in report.times_ms}
     side.figures = report.scores()
 
 
@@ -322,10 +360,6 @@ def _value(score: Score | None) -> float | None:
     return score.value if score is not None and math.isfinite(score.value) else None
 
 
-def _median(values: Sequence[float] | None) -> float | None:
-    return statistics.median(values) if values else None
-
-
 def _identity(side: Side) -> dict[str, Any]:
     return {
         "title": side.title,
@@ -339,6 +373,11 @@ def _identity(side: Side) -> dict[str, Any]:
 def told(value: Any) -> str:
     """A value for a table; one that is not there is a dash."""
     return "–" if value is None else str(value)
+
+
+def _change(difference: float | None) -> str:
+    """A difference for a table; what is exactly the same stands out as a bare 0."""
+    return "" if difference is None else f"{difference:+.3f}" if difference else "0"
 
 
 def _covered(coverage: float | None) -> str:

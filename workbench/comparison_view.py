@@ -17,10 +17,13 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from workbench.bridge import FRAME_TIMELINE, STAMP_TIMELINE
+from workbench.bridge import FRAME_TIMELINE, STAMP_TIMELINE, Bridge
 from workbench.comparison import Comparison
 from workbench.difference_pictures import LEGEND, difference_view, has_picture, log_difference
 from workbench.differences import Difference
+from workbench.pipeline import Run
+from workbench.report import RunReport
+from workbench.session import Session
 
 A, B, DIFFERENCE, COMPARISON = "A", "B", "difference", "comparison"
 SUMMARY_TAB = "summary"
@@ -153,8 +156,13 @@ class ComparisonView:
         stamp_ns: int,
         differences: Mapping[str, Mapping[str, Difference]],
         units: Mapping[str, str],
+        scores_a: Mapping[str, float],
+        scores_b: Mapping[str, float],
     ) -> None:
-        """The differences of one frame: pictures, and how much differs as plots over time."""
+        """The differences of one frame: pictures, and how much differs as plots over time.
+
+        ``units`` are those of the artifacts, ``scores_a`` and ``scores_b`` the frame's own.
+        """
         self._set_time(frame, stamp_ns)
         drawn: set[str] = set()
         for stage, own in differences.items():
@@ -163,9 +171,7 @@ class ComparisonView:
                 if has_picture(difference):
                     log_difference(self.recording, path, difference)
                     drawn.add(path)
-                    unit = units.get(artifact, "")
-                    name = f"{artifact}, B − A" + (f", {unit}" if unit else "")
-                    title = name if difference.signed is not None else f"{artifact}, A or B"
+                    title = _picture_title(artifact, difference, units.get(artifact, ""))
                     pictures = self._pictures.setdefault(stage, {})
                     if artifact not in pictures:
                         pictures[artifact] = difference_view(path, title, difference)
@@ -175,12 +181,10 @@ class ComparisonView:
         for path in sorted(self._drawn - drawn):
             self.recording.log(path, rr.Clear(recursive=True))
         self._drawn = drawn
-        a, b = self.comparison.a.scores, self.comparison.b.scores
-        for name in a:
-            if frame in a[name] and frame in b.get(name, {}):
-                change = b[name][frame] - a[name][frame]
-                if math.isfinite(change):
-                    self._plot(f"scores/{name}", change)
+        for name in [name for name in scores_a if name in scores_b]:
+            change = scores_b[name] - scores_a[name]
+            if math.isfinite(change) and (change or f"{COMPARISON}/scores/{name}" in self._plotted):
+                self._plot(f"scores/{name}", change)
         self._lay_out()
 
     def close(self) -> None:
@@ -201,11 +205,10 @@ class ComparisonView:
             self.recording.log(path, rr.SeriesLines(names=label), static=True)
 
     def _log_summary(self) -> None:
-        self.recording.log(
-            f"{COMPARISON}/summary",
-            rr.TextDocument(self.comparison.page(LEGEND), media_type="text/markdown"),
-            static=True,
-        )
+        pages = {"summary": self.comparison.page(LEGEND), "numbers": self.comparison.numbers_page()}
+        for name, page in pages.items():
+            document = rr.TextDocument(page, media_type="text/markdown")
+            self.recording.log(f"{COMPARISON}/{name}", document, static=True)
 
     # -- the layout -------------------------------------------------------------------------------
 
@@ -275,9 +278,61 @@ class ComparisonView:
             )
             if any(path.startswith(f"{COMPARISON}/{what}/") for path in self._plotted)
         ]
-        text = rrb.TextDocumentView(origin=f"{COMPARISON}/summary", name="what differs")
-        parts = [text, rrb.Vertical(*plots)] if plots else [text]
-        return rrb.Horizontal(*parts, column_shares=[2, 1][: len(parts)], name=SUMMARY_TAB)
+        texts = [
+            rrb.TextDocumentView(origin=f"{COMPARISON}/{what}", name=name)
+            for what, name in (("summary", "what differs"), ("numbers", "scores and times"))
+        ]
+        beside = rrb.Vertical(texts[1], rrb.Horizontal(*plots), row_shares=[3, 2])
+        parts = [texts[0], beside if plots else texts[1]]
+        return rrb.Horizontal(*parts, column_shares=[5, 4], name=SUMMARY_TAB)
+
+
+class RunsBeside:
+    """Logs the runs of A and B, each through a bridge of its own, and what differs."""
+
+    def __init__(
+        self,
+        view: ComparisonView,
+        sessions: Mapping[str, Session],
+        reports: Mapping[str, RunReport],
+    ) -> None:
+        self._view = view
+        self._reports = reports
+        self._streams: dict[str, Any] = {
+            side: PrefixedStream(view.recording, side) for side in sessions
+        }
+        self._bridges = {
+            side: Bridge(session, self._streams[side]) for side, session in sessions.items()
+        }
+        artifacts = sessions[A].pipeline.artifacts
+        self._units = {name: artifact.unit for name, artifact in artifacts.items()}
+
+    def log(
+        self,
+        runs: Mapping[str, Run],
+        scores: Mapping[str, Mapping[str, float]],
+        differences: Mapping[str, Mapping[str, Difference]],
+    ) -> None:
+        """One frame of both."""
+        for side, bridge in self._bridges.items():
+            bridge.log(runs[side], self._reports[side], scores[side])
+            layout = self._streams[side].blueprint
+            if layout is not None:
+                self._view.set_views(side, leaves(layout.root_container))
+        frame = runs[A].frame
+        self._view.log(frame.index, frame.stamp_ns, differences, self._units, scores[A], scores[B])
+
+    def close(self) -> None:
+        """What is known only at the end."""
+        for side, bridge in self._bridges.items():
+            bridge.close(self._reports[side])
+        self._view.close()
+
+
+def _picture_title(artifact: str, difference: Difference, unit: str) -> str:
+    if difference.signed is None:
+        return f"{artifact} (cyan: only A, yellow: only B)"
+    return f"{artifact}, B − A" + (f", {unit}" if unit else "")
 
 
 def _column(views: Sequence[Any], name: str) -> Any:

@@ -149,6 +149,11 @@ def closing_tables(report: RunReport, scores: bool = True) -> None:
     if found:
         rows = [row for stage, own in found.items() for row in score_rows(stage, own)]
         table("Against ground truth", SCORE_COLUMNS, rows)
+    troubles(report)
+
+
+def troubles(report: RunReport) -> None:
+    """What was warned of and what failed, a line each."""
     for says, count in report.warnings.items():
         out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)
     for (stage, says), count in report.failures.items():

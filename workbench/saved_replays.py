@@ -7,9 +7,10 @@ is held in memory while it is read, about as large as it is unpacked.
 from __future__ import annotations
 
 import re
+import statistics
 import uuid
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,9 @@ _TIMES, _SCORES = "/bench/times/", "/bench/scores/"
 _OWN = ("/bench/", "/recorded/", _PROPERTIES)
 _NEEDED = ("preset", "parameters", "recording", "code")
 _CLEAR = "Clear:"
+_VALUES, _UNKNOWN = "/values", "/unknown"
+"""A depth image cannot hold NaN: where one that is called ``values`` is not known is told by the
+classes of a segmentation image beside it, called ``unknown``."""
 
 Row = Mapping[str, Any]
 """Component name to its Arrow array, of one entity on one frame."""
@@ -56,9 +60,9 @@ class SavedReplay:
         return [line.partition("=")[0] for line in self.provenance["code"]]
 
     def side(self) -> Side:
-        """What the file tells of itself, with its numbers of every frame."""
+        """What the file tells of itself."""
         told = self.provenance
-        side = Side(
+        return Side(
             self.path.name,
             told["preset"][0],
             [line for line in told.get("changed", []) if line != "nothing"],
@@ -70,21 +74,32 @@ class SavedReplay:
                 "bench": told.get("bench", ["not told"])[0],
                 **_pairs(told.get("libraries", [])),
             },
+            self._median_ms(),
         )
-        for entity, rows in self.rows.items():
-            for frame, row in rows.items():
-                value = _scalar(row)
-                if value is None:
-                    continue
-                if entity.startswith(_SCORES):
-                    side.scores.setdefault(entity.removeprefix(_SCORES), {})[frame] = value
-                elif entity.startswith(_TIMES):
-                    side.times_ms.setdefault(entity.removeprefix(_TIMES), []).append(value)
-        return side
+
+    def scores(self, frame: int) -> dict[str, float]:
+        """What one frame scored, ``stage/name`` to value."""
+        found = {}
+        for entity in sorted(self.rows):
+            if entity.startswith(_SCORES):
+                value = _scalar(self.rows[entity].get(frame, {}))
+                if value is not None:
+                    found[entity.removeprefix(_SCORES)] = value
+        return found
+
+    def _median_ms(self) -> dict[str, float]:
+        found = {}
+        for entity in sorted(self.rows):
+            if entity.startswith(_TIMES):
+                values = [_scalar(row) for row in self.rows[entity].values()]
+                known = [value for value in values if value is not None]
+                if known:
+                    found[entity.removeprefix(_TIMES)] = statistics.median(known)
+        return found
 
     def pictures(self) -> list[str]:
-        """The entities that stages logged over the frames."""
-        return [entity for entity in self.rows if not entity.startswith(_OWN)]
+        """The entities that stages logged over the frames, by name: a file has no other order."""
+        return [entity for entity in sorted(self.rows) if not entity.startswith(_OWN)]
 
     def forward(self, recording: rr.RecordingStream, prefix: str) -> None:
         """Send everything that was logged on to another recording, under ``/prefix``."""
@@ -120,8 +135,8 @@ def read(path: Path) -> SavedReplay:
             layouts = reader.blueprints()
             layout = reader.stream(store=layouts[-1]).to_chunks() if layouts else []
     except (RuntimeError, ValueError, OSError) as error:
-        says = one_line(error).removeprefix("RuntimeError: ")
-        raise DataError(f"{path}: expected a saved replay (.rrd): {says}") from error
+        says = one_line(error).rpartition(f"{path}: ")[2]
+        raise DataError(f"{path}: expected a saved replay (.rrd), found: {says}") from error
     provenance = _provenance(chunks)
     if provenance is None:
         raise DataError(
@@ -160,7 +175,11 @@ def differences(
     for entity, (stage, name) in owners.items():
         row_a, row_b = (side.rows.get(entity, {}).get(frame) for side in (a, b))
         if row_a is not None and row_b is not None:
-            found.setdefault(stage, {})[name] = _row_difference(name, row_a, row_b)
+            unknown = entity.removesuffix(_VALUES) + _UNKNOWN
+            masks = [_unknown(side.rows.get(unknown, {}).get(frame)) for side in (a, b)]
+            if not entity.endswith(_VALUES):
+                masks = [None, None]
+            found.setdefault(stage, {})[name] = _row_difference(name, row_a, row_b, masks)
         elif row_a is not None or row_b is not None:
             only = "A" if row_a is not None else "B"
             found.setdefault(stage, {})[name] = Difference("missing", 1, None, f"only in {only}")
@@ -224,14 +243,27 @@ def _scalar(row: Row) -> float | None:
     return float(values[0].as_py()) if values is not None and len(values) == 1 else None
 
 
-def _row_difference(name: str, a: Row, b: Row) -> Difference:
-    if all(key in b and b[key].equals(a[key]) for key in a) and len(a) == len(b):
+def _unknown(row: Row | None) -> NDArray[np.bool_] | None:
+    image = _image(row) if row is not None else None
+    return image[1] != 0 if image is not None and image[0] == "SegmentationImage" else None
+
+
+def _row_difference(
+    name: str, a: Row, b: Row, unknown: Sequence[NDArray[np.bool_] | None]
+) -> Difference:
+    same = all(key in b and b[key].equals(a[key]) for key in a) and len(a) == len(b)
+    if same and unknown[0] is None and unknown[1] is None:
         return Difference("object", 0)
     image_a, image_b = _image(a), _image(b)
     if image_a is not None and image_b is not None and image_a[0] == image_b[0]:
         (kind, picture_a), (_, picture_b) = image_a, image_b
         if picture_a.shape == picture_b.shape and picture_a.dtype == picture_b.dtype:
+            for picture, mask in zip((picture_a, picture_b), unknown, strict=True):
+                if mask is not None and mask.shape == picture.shape and kind == "DepthImage":
+                    picture[mask] = np.nan
             return _image_difference(name, kind, picture_a, picture_b)
+    if same:
+        return Difference("object", 0)
     value_a, value_b = _scalar(a), _scalar(b)
     if value_a is not None and value_b is not None:
         says = f"{value_a:.6g} in A, {value_b:.6g} in B"
@@ -278,7 +310,9 @@ def _image(row: Row) -> tuple[str, NDArray[Any]] | None:
             pixels: NDArray[Any] = np.asarray(row[f"{kind}:buffer"].values).view(dtype)
             if pixels.size != np.prod(shape):
                 return None
-            return kind, pixels.reshape(shape if channels > 1 else shape[:2])
+            image = pixels.reshape(shape if channels > 1 else shape[:2])
+            # Rerun's depth images of whole numbers have no way to be unknown either.
+            return kind, image.astype(np.float32) if kind == "DepthImage" else image
     return None
 
 

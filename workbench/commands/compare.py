@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from workbench import interrupts
-from workbench.console import end, err, interruptible, out, table, tracked
+from workbench.console import end, err, interruptible, out, table, tracked, troubles
 from workbench.errors import DataError, UsageError
 from workbench.files import check_output
 from workbench.plugins import find_stages
 from workbench.session import Options, Session, check_stage
-from workbench.settings import Settings, SettingsError, preset_names, resolve
+from workbench.settings import Settings, SettingsError, preset_names, reason_in, resolve
 from workbench.stage import Artifact, Stage
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from workbench.viewer import Stream
 
 _RRD = b"RRF2"
+_OF_THE_RUN = ("recording", "defects", "failures", "warnings")
 
 
 def run(
@@ -48,8 +49,11 @@ def run(
             check_output(flag, path)
     targets = _Targets(save, screenshot, web, size, show, as_json, options.plugins)
     if len(files) == 1:
+        _refuse_replay(options.recording)
         if side_b is None:
-            raise UsageError("--b: expected a preset, a TOML file or stage.parameter=value")
+            raise UsageError(
+                "--b: expected a preset, a TOML file or stage.parameter=value, found nothing"
+            )
         _compare_configurations(options, side_a, side_b, targets)
     elif len(files) == 2:
         _refuse_flags(options, side_a, side_b)
@@ -64,13 +68,14 @@ def run(
 def _compare_configurations(
     options: Options, side_a: str | None, side_b: str, targets: _Targets
 ) -> None:
-    _refuse_replay(options.recording)
     stages = find_stages(options.plugins)
     check_stage(options.until, stages, "--until")
     check_stage(targets.show, stages, "--show")
     base = resolve(stages, options.preset, options.config, options.assignments)
-    settings_a = base if side_a is None else _settings_of(side_a, "--a", options, stages)
-    settings_b = _settings_of(side_b, "--b", options, stages)
+    settings_a, title_a = base, f"preset {base.preset}"
+    if side_a is not None:
+        settings_a, title_a = _settings_of(side_a, "--a", options, stages)
+    settings_b, title_b = _settings_of(side_b, "--b", options, stages)
     session = Session.open(options)
     sessions = {
         "A": replace(session, pipeline=session.pipeline.with_settings(settings_a)),
@@ -79,13 +84,11 @@ def _compare_configurations(
     total = session.count()
     if total == 0:
         raise DataError(f"{options.recording}: no frame in it, or in --frames")
-    from workbench.bridge import Bridge
     from workbench.comparison import Comparison, side_of, take_report, units_of
-    from workbench.comparison_view import ComparisonView, PrefixedStream, leaves
     from workbench.differences import Totals, differences_of_runs
     from workbench.report import RunReport
 
-    titles = {"A": side_a or f"preset {base.preset}", "B": side_b}
+    titles = {"A": title_a, "B": title_b}
     sides = {name: side_of(titles[name], own.provenance()) for name, own in sessions.items()}
     reports = {name: RunReport(own) for name, own in sessions.items()}
     pipeline = sessions["A"].pipeline
@@ -95,77 +98,64 @@ def _compare_configurations(
         Totals({stage.name: stage.gives for stage in pipeline.stages}),
         units_of(pipeline.stages),
     )
-    units = {name: artifact.unit for name, artifact in pipeline.artifacts.items()}
     with targets.opened(options.recording.stem, comparison) as stream:
-        view = bridges = None
+        shown = None
         if stream is not None:
+            from workbench.comparison_view import ComparisonView, RunsBeside
+
             view = ComparisonView(stream.recording, comparison, targets.show)
-            streams: dict[str, Any] = {
-                name: PrefixedStream(stream.recording, name) for name in sessions
-            }
-            bridges = {name: Bridge(own, streams[name]) for name, own in sessions.items()}
+            shown = RunsBeside(view, sessions, reports)
         with interruptible(reports["A"]):
             for run_a in tracked(sessions["A"].runs(), "compare", total):
                 runs = {"A": run_a, "B": sessions["B"].pipeline.run(run_a.frame)}
-                index = run_a.frame.index
-                for name, own in runs.items():
-                    scores = reports[name].add(own)
-                    sides[name].take(index, scores, own.stage_ms)
-                    if bridges is not None and view is not None:
-                        bridges[name].log(own, reports[name], scores)
-                        layout = streams[name].blueprint
-                        if layout is not None:
-                            view.set_views(name, leaves(layout.root_container))
+                scores = {name: reports[name].add(own) for name, own in runs.items()}
                 found = differences_of_runs(pipeline.stages, runs["A"], runs["B"])
-                comparison.totals.add(index, found)
-                comparison.frames += 1
-                if view is not None:
-                    view.log(index, run_a.frame.stamp_ns, found, units)
+                comparison.take(run_a.frame.index, found, scores["A"], scores["B"])
+                if shown is not None:
+                    shown.log(runs, scores, found)
                 interrupts.check()
         report = reports["A"]
         comparison.interrupted = bool(report.interrupted)
         for name, side in sides.items():
             take_report(side, reports[name])
+        if shown is not None:
+            shown.close()
         report.take_failures(reports["B"], "B")
-        if bridges is not None and view is not None:
-            for name, bridge in bridges.items():
-                bridge.close(reports[name])
-            view.close()
-        failures = [
-            {"stage": stage, "says": says, "frames": count}
-            for (stage, says), count in report.failures.items()
-        ]
-        targets.tell(comparison, {"recording": options.recording.name, "failures": failures})
+        told = report.as_dict()
+        targets.tell(comparison, {key: told[key] for key in _OF_THE_RUN})
         if not targets.as_json:
-            for (stage, says), count in report.failures.items():
-                out.print(
-                    f"FAILED, {count} frames: {stage}: {says}", style="bold red", markup=False
-                )
+            troubles(report)
         targets.serve(stream, bool(report.interrupted))
     targets.wrote()
     end(report)
 
 
-def _settings_of(spec: str, flag: str, options: Options, stages: Mapping[str, Stage]) -> Settings:
+def _settings_of(
+    spec: str, flag: str, options: Options, stages: Mapping[str, Stage]
+) -> tuple[Settings, str]:
     """The settings that ``--a`` or ``--b`` names, with every ``--set`` laid over them.
 
     A preset's name, else a file, else ``stage.parameter=value[,…]`` over what --preset, --config
-    and --set say.  Raises :class:`UsageError`.
+    and --set say.  And what to call them: the name as it was given, with the reason that a file
+    was kept for.  Raises :class:`UsageError`.
     """
     presets = preset_names(stages.values())
     try:
         if spec in presets:
-            return resolve(stages, spec, None, options.assignments)
+            return resolve(stages, spec, None, options.assignments), f"preset {spec}"
         if Path(spec).is_file():
-            return resolve(stages, None, Path(spec), options.assignments)
+            settings = resolve(stages, None, Path(spec), options.assignments)
+            reason = reason_in(Path(spec))
+            return settings, f"{spec} ({reason})" if reason else spec
         if "=" in spec:
-            own = [part.strip() for part in spec.split(",") if part.strip()]
-            return resolve(stages, options.preset, options.config, [*options.assignments, *own])
+            own = [*options.assignments, *(part for part in spec.split(",") if part.strip())]
+            settings = resolve(stages, options.preset, options.config, own)
+            return settings, f"preset {settings.preset}"
     except SettingsError as error:
         says = str(error)
         for named in (
             f"--config {spec}: ",
-            *(f"--set {part.strip()}: " for part in spec.split(",")),
+            *(f"--set {part}: " for part in spec.split(",")),
         ):
             says = says.removeprefix(named)
         raise SettingsError(f"{flag} {spec}: {says}") from error
@@ -238,10 +228,10 @@ def _compare_replays(path_a: Path, path_b: Path, targets: _Targets) -> None:
                 view.set_views(prefix, replay.views)
         for frame in tracked(frames, "compare", len(frames)):
             found = differences(a, b, frame, owners)
-            comparison.totals.add(frame, found)
-            comparison.frames += 1
+            scores = a.scores(frame), b.scores(frame)
+            comparison.take(frame, found, *scores)
             if view is not None:
-                view.log(frame, a.stamps_ns[frame], found, {})
+                view.log(frame, a.stamps_ns[frame], found, {}, *scores)
             interrupts.check()
         if view is not None:
             view.close()
