@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from test_replay import assert_whole, chunks, frames_of, vulkan_drivers
+from test_replay import assert_whole, chunks, frames_of, rerun, vulkan_drivers
 
 from workbench.session import Options, Session
 
@@ -227,6 +227,29 @@ def test_saved_replays_tell_what_the_recording_tells(
     for side in "AB":
         assert shown[f"{side}/linked_edges/linked"] == shown[f"{side}/world/cloud"] == {0, 1}
     assert shown["difference/linked_edges/linked"] == {0, 1}
+
+
+def test_a_replay_is_read_however_its_frames_are_packed(
+    bench: Command, tmp_path: Path, replays: dict[str, Path]
+) -> None:
+    """Rerun puts the rows of several frames into one chunk as it sees fit."""
+    for name in ("default", "changed"):
+        packed = rerun("rrd", "optimize", replays[name], "-o", tmp_path / f"{name}.rrd")
+        assert packed.returncode == 0, packed.stderr
+    rows = [
+        chunk.num_rows
+        for chunk in chunks(tmp_path / "default.rrd")
+        if chunk.entity_path == "/linked_edges/linked"
+    ]
+    assert 2 in rows
+    told = bench("compare", replays["default"], "default.rrd", "--json").json
+    assert told["same"] is True
+    one = bench("compare", replays["default"], replays["changed"], "--json").json
+    other = bench("compare", "default.rrd", "changed.rrd", "--json").json
+    for key in ("results", "scores", "times", "parameters"):
+        assert one[key] == other[key], key
+    linked = one["results"][0]
+    assert (linked["artifact"], linked["kind"]) == ("linked", "codes") and linked["share"] > 0
 
 
 def test_a_picture_of_depth_differs_as_the_depth_does(bench: Command, scene: Path) -> None:

@@ -47,7 +47,7 @@ class SavedReplay:
     path: Path
     provenance: Mapping[str, list[str]]
     chunks: list[Any] = field(repr=False)
-    rows: dict[str, dict[int, Row]] = field(repr=False)
+    rows: Mapping[str, Mapping[int, Row]] = field(repr=False)
     """Entity to frame to what was logged there then; the stages' own entities and scalars."""
     stamps_ns: dict[int, int] = field(repr=False)
     """Frame to its stamp."""
@@ -143,7 +143,7 @@ def read(path: Path) -> SavedReplay:
             f"{path}: expected a replay saved by workbench, found a recording of "
             f"{recordings[0].application_id!r} without a replay's provenance"
         )
-    rows: dict[str, dict[int, Row]] = {}
+    rows: dict[str, dict[int, dict[str, Any]]] = {}
     stamps_ns: dict[int, int] = {}
     for chunk in chunks:
         if chunk.is_static or FRAME_TIMELINE not in chunk.timeline_names:
@@ -155,11 +155,10 @@ def read(path: Path) -> SavedReplay:
             stamps_ns.update(zip(frames, stamps.tolist(), strict=True))
         own = rows.setdefault(chunk.entity_path, {})
         for index, frame in enumerate(frames):
+            # What was logged in one call may be spread over several chunks.
             row = _row(batch, index)
             if row:
-                own[frame] = row
-            else:
-                own.pop(frame, None)
+                own.setdefault(frame, {}).update(row)
     return SavedReplay(path, provenance, chunks, rows, stamps_ns, _views(layout))
 
 
@@ -306,8 +305,8 @@ def _image(row: Row) -> tuple[str, NDArray[Any]] | None:
             model = told.get("color_model")
             channels = rr.ColorModel(model).num_channels() if model is not None else 1
             shape = (told["height"], told["width"], channels)
-            # The buffer is one list of bytes.
-            pixels: NDArray[Any] = np.asarray(row[f"{kind}:buffer"].values).view(dtype)
+            # A buffer is one list of bytes; the array around it may hold other frames' as well.
+            pixels: NDArray[Any] = np.asarray(row[f"{kind}:buffer"][0].values).view(dtype)
             if pixels.size != np.prod(shape):
                 return None
             image = pixels.reshape(shape if channels > 1 else shape[:2])
