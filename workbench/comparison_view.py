@@ -31,6 +31,7 @@ SAME_TAB = "the same in both"
 
 _OF_THE_BENCH = ("recorded", "bench")
 _TALLEST_STACK = 3
+_LEGEND_SHARES = [29, 1]
 
 
 class PrefixedStream:
@@ -205,7 +206,11 @@ class ComparisonView:
             self.recording.log(path, rr.SeriesLines(names=label), static=True)
 
     def _log_summary(self) -> None:
-        pages = {"summary": self.comparison.page(LEGEND), "numbers": self.comparison.numbers_page()}
+        pages = {
+            "summary": self.comparison.page(LEGEND),
+            "numbers": self.comparison.numbers_page(),
+            "legend": LEGEND,
+        }
         for name, page in pages.items():
             document = rr.TextDocument(page, media_type="text/markdown")
             self.recording.log(f"{COMPARISON}/{name}", document, static=True)
@@ -241,7 +246,8 @@ class ComparisonView:
             ]
             filled = [column for column in columns if column is not None]
             if filled:
-                tabs.append(rrb.Horizontal(*filled, name=stage))
+                beside = rrb.Horizontal(*filled)
+                tabs.append(rrb.Vertical(beside, _legend(), row_shares=_LEGEND_SHARES, name=stage))
         same = [
             view
             for stage in ("recorded", *self.comparison.totals.of)
@@ -329,9 +335,13 @@ class RunsBeside:
         self._view.close()
 
 
+def _legend() -> Any:
+    return rrb.TextDocumentView(origin=f"{COMPARISON}/legend", name="colours", titlebar=False)
+
+
 def _picture_title(artifact: str, difference: Difference, unit: str) -> str:
     if difference.signed is None:
-        return f"{artifact} (cyan: only A, yellow: only B)"
+        return artifact
     return f"{artifact}, B − A" + (f", {unit}" if unit else "")
 
 
