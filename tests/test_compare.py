@@ -46,6 +46,16 @@ def replays(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return made
 
 
+def layout_of(rrd: Path) -> list[Any]:
+    """The views of the layout in a saved file, in reading order."""
+    import rerun.chunk
+
+    from workbench.saved_replays import views_of
+
+    reader = rerun.chunk.RrdReader(str(rrd))
+    return views_of(reader.stream(store=reader.blueprints()[-1]).to_chunks())
+
+
 def session_of(scene: Path, frames: int, *assignments: str) -> Session:
     return Session.open(Options(scene, assignments=assignments, frames=(0, frames)))
 
@@ -96,8 +106,15 @@ def test_one_parameter_differs_and_what_is_downstream_of_it(
     rows, columns = np.nonzero(changed.any(axis=0))
     assert linked["box"] == [columns.min(), rows.min(), columns.max(), rows.max()]
 
-    # Both and the difference are on one timeline, in one recording.
+    # Both and the difference are on one timeline, in one recording, side by side.
     assert_whole(tmp_path / "a.rrd")
+    origins = ["/" + str(view.origin).lstrip("/") for view in layout_of(tmp_path / "a.rrd")]
+    assert origins[0] == "/comparison/summary"
+    beside = ["/A/linked_edges/linked", "/B/linked_edges/linked", "/difference/linked_edges/links"]
+    assert beside == sorted(beside, key=origins.index)
+    # What is the same is shown once.
+    assert "/A/depth_cloud/depth" in origins and "/B/depth_cloud/depth" not in origins
+    assert "/B/recorded/near" not in origins
     shown = frames_of(tmp_path / "a.rrd")
     for side in "AB":
         for entity in ("linked_edges/linked", "depth_cloud/depth", "bench/times/edge_stack"):
@@ -279,15 +296,18 @@ def test_a_replay_is_the_same_as_itself_and_as_its_twin(
 
 
 def test_replays_that_do_not_match_are_told_and_not_refused(
-    bench: Command, replays: dict[str, Path], twins: dict[str, Path]
+    bench: Command, tmp_path: Path, replays: dict[str, Path], twins: dict[str, Path]
 ) -> None:
     told = bench("compare", replays["default"], replays["later"], "--json").json
     assert told["frames"] == 1
     assert told["frames_only_a"] == [0] and told["frames_only_b"] == [2]
     assert any("frames only in A: 0" in says for says in told["remarks"])
     bench("replay", twins["json"], "--save", "twin.rrd", "--frames", ":1", "--until", "edge_stack")
-    ended = bench("compare", replays["default"], "twin.rrd")
+    ended = bench("compare", replays["default"], "twin.rrd", "--save", "a.rrd")
     assert ended.code == 0
+    views = [str(view.origin) for view in layout_of(tmp_path / "a.rrd")]
+    # Not A's images alone, as where they are B's as well.
+    assert {"/A/recorded/near", "/B/recorded/near"} <= set(views)
     assert "the recordings are not the same" in ended.out
     # The recording's digest is that of the file; its images are the same ones.
     assert "no difference in: registration" in ended.out
@@ -402,12 +422,12 @@ def test_an_interrupted_comparison_leaves_a_whole_file(
 ) -> None:
     child = started("compare", long_recordings[120], "--b", "paper", "--save", "a.rrd", "--json")
     part = tmp_path / "a.rrd.part"
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while not (part.exists() and part.stat().st_size > 1 << 21):
         assert child.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     child.send_signal(signal.SIGTERM)
-    assert child.wait(30) == 143
+    assert child.wait(60) == 143
     assert_whole(tmp_path / "a.rrd")
     told = json.loads((tmp_path / "stdout").read_text())
     assert told["interrupted"] and 0 < told["frames"] < 120

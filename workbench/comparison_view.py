@@ -248,9 +248,16 @@ class ComparisonView:
             if filled:
                 beside = rrb.Horizontal(*filled)
                 tabs.append(rrb.Vertical(beside, _legend(), row_shares=_LEGEND_SHARES, name=stage))
+        recordings = [
+            row["same"] for row in self.comparison.digests() if row["what"] == "recording"
+        ]
+        shared = ["recorded"] if all(recordings) else []
+        if not shared:
+            sides = [_column(self._prefixed(side, "recorded"), side) for side in (A, B)]
+            tabs.append(rrb.Horizontal(*(side for side in sides if side), name="recorded"))
         same = [
             view
-            for stage in ("recorded", *self.comparison.totals.of)
+            for stage in (*shared, *self.comparison.totals.of)
             if stage not in differing
             for view in self._prefixed(A, stage)
         ]

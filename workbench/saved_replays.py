@@ -159,7 +159,7 @@ def read(path: Path) -> SavedReplay:
             row = _row(batch, index)
             if row:
                 own.setdefault(frame, {}).update(row)
-    return SavedReplay(path, provenance, chunks, rows, stamps_ns, _views(layout))
+    return SavedReplay(path, provenance, chunks, rows, stamps_ns, views_of(layout))
 
 
 def differences(
@@ -370,7 +370,7 @@ def _text(value: bytes | None) -> str | None:
     return None if value is None else value.decode()
 
 
-def _views(chunks: Iterable[Any]) -> list[rrb.View]:
+def views_of(chunks: Iterable[Any]) -> list[rrb.View]:
     """The views of a saved layout, in reading order, with their queries and properties."""
     found: dict[str, Any] = {
         chunk.entity_path: chunk.to_record_batch() for chunk in chunks if chunk.num_rows
