@@ -385,7 +385,7 @@ def test_a_view_looks_at_the_same_under_a_prefix() -> None:
         ("{default} {changed} {default}", 2, "expected one recording or two saved replays"),
         ("{default} gone.rrd", 1, "gone.rrd: no such file"),
         ("{default} {scene}", 1, "scene.mcap: expected a saved replay (.rrd), found"),
-        ("{default} cut.rrd", 1, "cut.rrd: expected a saved replay (.rrd), found"),
+        ("{default} cut.rrd", 1, "rerun rrd optimize cut.rrd"),
         ("{default} empty.rrd", 1, "empty.rrd: expected"),
         ("other.rrd {default}", 1, "other.rrd: expected a replay saved by workbench"),
     ],

@@ -136,6 +136,8 @@ def read(path: Path) -> SavedReplay:
             layout = reader.stream(store=layouts[-1]).to_chunks() if layouts else []
     except (RuntimeError, ValueError, OSError) as error:
         says = one_line(error).rpartition(f"{path}: ")[2]
+        if "decode" in says:
+            says += f" (what is whole is saved by: rerun rrd optimize {path} -o whole.rrd)"
         raise DataError(f"{path}: expected a saved replay (.rrd), found: {says}") from error
     provenance = _provenance(chunks)
     if provenance is None:
