@@ -52,7 +52,7 @@ def test_help_names_every_flag_and_says_something_of_each(bench: Command, comman
 
 def test_commands_that_run_stages_share_their_flags() -> None:
     shared = {"calibration", "models", "preset", "config", "set", "topic", "frames", "until"}
-    for name in ("replay", "export", "evaluate"):
+    for name in ("replay", "export", "evaluate", "compare"):
         flags = {flag.lstrip("-") for one in COMMANDS[name].params for flag in one.opts}
         assert flags >= shared | {"plugin", "json"}, name
 

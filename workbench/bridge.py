@@ -145,6 +145,7 @@ class Bridge:
                 code=[f"{k}={v}" for k, v in provenance["code"].items()],
                 resources=[f"{k}={v['digest']}" for k, v in provenance["resources"].items()]
                 or ["none"],
+                libraries=[f"{k}={v}" for k, v in provenance["libraries"].items()],
             ),
         )
 

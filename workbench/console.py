@@ -168,6 +168,11 @@ def closing_tables(report: RunReport, scores: bool = True) -> None:
         )
     if scores:
         scores_beside({report.session.pipeline.settings.preset: report.scores()})
+    troubles(report)
+
+
+def troubles(report: RunReport) -> None:
+    """What was warned of and what failed, a line each."""
     for says, count in report.warnings.items():
         out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)
     for (stage, says), count in report.failures.items():
