@@ -215,6 +215,19 @@ def test_what_shows_of_a_covered_part_names_it_or_nothing_does(
         assert f"what shows is {named}'s" in verdict["reason"]
 
 
+def test_what_could_be_either_of_two_parts_is_named_after_neither() -> None:
+    """A plate's end is hidden, beyond which it could go on as the longer plate does."""
+    longer = RECTANGLE * [1.1, 1.0]
+    both = make_database({"plate": views_of(RECTANGLE), "longer plate": views_of(longer)})
+    scene = Scene()
+    low = scene.add(RECTANGLE, 0.0, (0.0, 0.0, 0.785))
+    end = np.array([[20, -30], [60, -30], [60, 30], [20, 30]]) * 1e-3
+    scene.add(end, 0.0, (0.0, 0.0, 0.770))
+    candidates, _ = scene.judge(both)
+    row = candidates[candidates["label"] == low][0]
+    assert row["reason"] == Reason.OCCLUDED and row["visible_model"] == -1
+
+
 def test_without_hidden_shares_nothing_is_named_by_what_shows(database: Database) -> None:
     scene = Scene()
     scene.add(RECTANGLE, 0.0, (0.055, 0.0, 0.785))

@@ -33,8 +33,9 @@ _IN_FRONT_MM = 2.0
 _BORDER_PX = 0.4
 """A border that is known no better than this, all around, is the misfit that the right part has."""
 
-_CLEARLY = 2.0
-"""The next best part must fit so much worse."""
+_CLEARLY = 1.5
+"""The next best part's misfit must be so many times what a border explains, or what is hidden could
+make either of the two."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Visible:
             self.model >= 0
             and self.hidden_share <= most_hidden
             and self.misfit <= self.allowed
-            and self.next_misfit >= _CLEARLY * self.misfit
+            and self.next_misfit > _CLEARLY * self.allowed
         )
 
 

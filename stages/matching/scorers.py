@@ -281,12 +281,13 @@ class PoseScorer(Scorer):
     """Rotation (modulo the symmetry that training found), normal and centroid of each pose.
 
     Rotation is scored where the pose's face is the one on which the part was trained, or the
-    opposite one: of the others the recording does not say which way is 0.
+    opposite one: of the others the recording does not say which way is 0.  A pose that says that
+    its rotation is open is counted, and has no error.
     """
 
     def __init__(self) -> None:
-        self.frames = 0
         self.poses = 0
+        self.open = 0
         self.rotations = _Rotations()
         self.errors: dict[str, _Errors] = {}
 
@@ -317,6 +318,9 @@ class PoseScorer(Scorer):
             }
             for key, value in own.items():
                 self.errors.setdefault(key, _Errors()).add(value)
+            if pose["open_rotations_deg"]:
+                self.open += 1
+                continue
             turned = rotation_error_deg(matrix[:3, :3], face.normal, rotation, pose)
             if turned is not None:
                 tilt_deg, own["rotation_error_deg"] = turned
@@ -325,6 +329,9 @@ class PoseScorer(Scorer):
 
     def summary(self) -> list[Score]:
         scores: list[Score] = []
+        if self.poses:
+            note = f"of {self.poses} poses"
+            scores.append(Score("rotation left open", float(self.open), "poses", note=note))
         for tilt, errors in sorted(self.rotations.by_tilt.items()):
             share, note = errors.count / self.poses, "modulo each part's period"
             published = "7.6 (2.1 % of a turn)" if tilt != "tilted farther" else "not promised"
