@@ -1,6 +1,6 @@
 """Whether ``workbench why`` tells the truth: random pixels of a recording, held to the artifacts.
 
-    python benchmarks/check_why.py REC [--calibration FILE] [--models FILE] [--pixels 200]
+    python benchmarks/check_why.py REC [--calibration FILE] [--models FILE] [--pixels 200] [--list]
 
 At each pixel every stage's story is compared with that pixel's artifacts, and the smallest change
 that is named is run anew, from a configuration file as ``--config`` would read it and with nothing
@@ -30,7 +30,7 @@ from workbench.pipeline import ResultStore
 from workbench.recording import Frame
 from workbench.session import Options, Session
 from workbench.settings import adjusted, to_toml
-from workbench.why import Search, image_size, smallest_change, story
+from workbench.why import Search, image_size, outcome, smallest_change, story
 
 STORE_BYTES = 1 << 30
 
@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--models", type=Path)
     parser.add_argument("--pixels", type=int, default=200)
     parser.add_argument("--seed", type=int, default=5)
+    parser.add_argument("--list", action="store_true", help="a line for each change")
     given = parser.parse_args()
     named = {"calibration": given.calibration, "models": given.models}
     options = Options(given.recording, {name: path for name, path in named.items() if path})
@@ -85,12 +86,14 @@ def main() -> None:
             if found.change is None:
                 continue
             changes += 1
-            if turns(options, session, run.frame, x, y, found):
-                turning += 1
-            else:
+            turned = turns(options, session, run.frame, x, y, found)
+            turning += turned
+            if given.list or not turned:
                 out.print(
-                    f"frame {run.frame.index} pixel {x},{y}: {found.change} turns nothing",
+                    f"frame {run.frame.index} pixel {x},{y} {seconds[-1]:.1f} s: "
+                    f"{'turns' if turned else 'TURNS NOTHING'}: {outcome(found)}",
                     markup=False,
+                    soft_wrap=True,
                 )
     out.print(f"{stories} pixels, {agreeing} agree with the artifacts in every stage")
     out.print(f"{changes} smallest changes named, {turning} turn the verdict when run")

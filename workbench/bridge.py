@@ -31,6 +31,8 @@ _CHAPTER_SHARE = 2.4
 
 
 _MARK = "bench/pixel"
+_STORY = "bench/why/story"
+_OUTCOME = "bench/why/outcome"
 _MARK_COLOUR = (255, 60, 220)
 _MARK_INNER_PX, _MARK_OUTER_PX = 2.5, 9.0
 
@@ -130,8 +132,11 @@ class Bridge:
             self._paths[owner] = keeper.paths
             self._pictures |= keeper.pictures
 
-    def mark(self, x: int, y: int, page: str) -> None:
-        """Mark pixel (x, y) on the pictures, with its story (markdown), whatever the frame."""
+    def mark(self, x: int, y: int, story: str, outcome: str = "") -> None:
+        """Mark pixel (x, y) on the pictures, whatever the frame, and tell its story (markdown).
+
+        ``outcome`` is what a search for the smallest change found, which stands below the story.
+        """
         # Rerun's images have their first pixel from 0 to 1.
         u, v = x + 0.5, y + 0.5
         strokes = [
@@ -146,9 +151,8 @@ class Bridge:
             ),
             static=True,
         )
-        self.recording.log(
-            "bench/why", rr.TextDocument(page, media_type="text/markdown"), static=True
-        )
+        for path, text in ((_STORY, story), (_OUTCOME, outcome or "*not looked for*")):
+            self.recording.log(path, rr.TextDocument(text, media_type="text/markdown"), static=True)
 
     def close(self, report: RunReport) -> None:
         """What is known only at the end: the recording's defects in full, and how it pairs."""
@@ -299,8 +303,12 @@ class Bridge:
         )
         if self.asks:
             _show_mark(page, self._pictures_on_grid(run))
-            story = rrb.TextDocumentView(origin="bench/why", name="why")
-            page = rrb.Horizontal(page, story, column_shares=[3.2, 1.0])
+            told = rrb.Vertical(
+                rrb.TextDocumentView(origin=_STORY, name="why"),
+                rrb.TextDocumentView(origin=_OUTCOME, name="what would turn it"),
+                row_shares=[4.0, 1.0],
+            )
+            page = rrb.Horizontal(page, told, column_shares=[3.0, 1.0])
         return rrb.Blueprint(
             page,
             rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),

@@ -257,7 +257,7 @@ class _Spent(Exception):  # noqa: N818
 
 
 class _Trials:
-    """Runs of one frame with one parameter changed, as far as the first stage that is asked."""
+    """Runs of one frame with one parameter changed, through what the asked stages need."""
 
     def __init__(
         self,
@@ -276,10 +276,12 @@ class _Trials:
         self.ask(*asked)
 
     def ask(self, *stages: str) -> None:
-        """Ask these stages from now on, the last in the pipeline first."""
-        self.pipeline = self._whole.up_to(stages[0])
+        """Ask these stages from now on."""
+        needed = {one.name for name in stages for one in self._whole.up_to(name).stages}
+        whole = self._whole.stages
+        self.pipeline = self._whole.with_stages([one for one in whole if one.name in needed])
         self._stages = {one.name: one for one in self.pipeline.stages}
-        self._asked = [self._stages[name] for name in stages if name in self._stages]
+        self._asked = [self._stages[name] for name in stages]
 
     def verdicts(self, address: str, value: Any) -> dict[str, str]:
         """The verdicts with this value at this address, of the asked stages that have one."""
@@ -538,21 +540,22 @@ def _percent(share: float) -> str:
 
 
 def as_markdown(story: Story, search: Search | None = None) -> str:
-    """The story as a page: a heading for each stage with its verdict, a line for each finding.
+    """The story as a page: each stage with its verdict, and a line for each finding.
 
     With a ``search`` it ends with what that found.
     """
-    lines = [f"# Pixel {story.x}, {story.y} of frame {story.index}"]
+    lines = [f"## Pixel {story.x}, {story.y} of frame {story.index}"]
     for told in story.stages:
-        lines += ["", f"## {told.stage}" + (f": {told.verdict}" if told.verdict else "")]
+        verdict = f": {told.verdict}" if told.verdict else ""
+        lines += ["", f"**{told.stage}{verdict}**", ""]
         if told.trouble is not None:
-            lines.append(f"- **{told.trouble}**")
+            lines.append(f"- *{told.trouble}*")
         elif not told.findings:
             lines.append("- says nothing of single pixels")
         for finding, threshold in zip(told.findings, told.thresholds, strict=True):
-            lines.append(f"- {finding.says}" + (f" (`{threshold}`)" if threshold else ""))
+            lines.append(f"- {finding.says}" + (f" · `{threshold}`" if threshold else ""))
     if search is not None:
-        lines += ["", "## What would turn it", outcome(search)]
+        lines += ["", "**What would turn it**", "", outcome(search)]
     return "\n".join(lines) + "\n"
 
 

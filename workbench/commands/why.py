@@ -56,16 +56,19 @@ def run(
     except UsageError as error:
         raise UsageError(f"--pixel {pixel}: {str(error).partition(': ')[2]}") from error
     if stage is not None and stage not in told.verdicts:
-        raise DataError(f"--stage {stage}: it has no verdict on pixel {x},{y} of frame {frame}")
+        trouble = next(one.trouble for one in told.stages if one.stage == stage)
+        reason = f": {trouble}" if trouble else ""
+        raise DataError(f"--stage {stage}: no verdict on pixel {x},{y} of frame {frame}{reason}")
     if not as_json:
         _print_story(session, told)
     found = _search(session, result, told, stage) if search else None
     if as_json:
         document = as_dict(told, found) | {"provenance": session.provenance()}
         print(to_json(document))
-    elif search:
-        out.print(_terminal(outcome(found)), soft_wrap=True)
-    _show(session, result, told, found, save, screenshot, size, quiet=as_json)
+    ending = outcome(found) if search else ""
+    if ending and not as_json:
+        out.print(_terminal(ending), soft_wrap=True)
+    _show(session, result, told, ending, save, screenshot, size, as_json)
     raise typer.Exit(EXIT_FAILED if any(one.trouble for one in told.stages) else 0)
 
 
@@ -131,7 +134,7 @@ def _show(
     session: Session,
     result: Run,
     told: Story,
-    found: Search | None,
+    ending: str,
     save: Path | None,
     screenshot: Path | None,
     window: tuple[int, int],
@@ -154,7 +157,7 @@ def _show(
             err.print(f"no viewer: {stream.trouble}", soft_wrap=True, markup=False)
         bridge = Bridge(session, stream.recording, asks=True)
         bridge.log(result, report, report.add(result))
-        bridge.mark(told.x, told.y, as_markdown(told, found))
+        bridge.mark(told.x, told.y, as_markdown(told), ending)
         bridge.close(report)
     for path in (save, screenshot):
         if path is not None and path.exists() and not quiet:
