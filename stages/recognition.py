@@ -213,8 +213,8 @@ class Recognition(Stage):
             says = f"region {label} is background, so no candidate"
             return [Finding(says, values, None, "no candidate", beside or f"region {label}")]
         if not len(rows):
-            says = f"region {label} has no plane to be seen along, so it is no candidate"
-            return [Finding(says, values, None, "no candidate", beside)]
+            says = f"region {label} is refused: it has no plane to be seen along"
+            return [Finding(says, values, None, "refused", beside)]
         row, rules = rows[0], rules_of(p)
         told = checks(row, region, database, rules)
         knobs = {

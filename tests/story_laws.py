@@ -102,7 +102,9 @@ def _recognition(x: int, y: int, a: Mapping[str, Any]) -> str:
     if a["verdict"] is None:
         return ""
     if not len(rows):
-        return "no candidate"
+        label = a["labels"][y, x]
+        seen = label > 0 and not a["regions"]["background"][label - 1]
+        return "refused" if seen else "no candidate"
     if rows[0]["reason"] != Reason.NONE:
         return "refused"
     return "picked" if a["verdict"]["region"] == a["labels"][y, x] else "not the highest"

@@ -244,32 +244,67 @@ def test_the_least_share_of_a_range_wins_and_is_as_fine_as_the_step_allows() -> 
     assert "judge.level" in outcome(found) and "0.2 %" in outcome(found)
 
 
+class Fixed(Judge):
+    """Judges by a level that is no parameter."""
+
+    name = "fixed"
+    gives = (Artifact("enough", "bool", "H W"),)
+    Parameters = StageParameters
+
+    def compute(self, inputs: Mapping[str, Any], parameters: Any) -> dict[str, Any]:
+        return {"enough": inputs["total"] >= 5}
+
+    def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        return [Finding("it is", verdict="over" if artifacts["enough"][y, x] else "under")]
+
+
+AT_THEIR_ENDS = ("many.offset=10", "many.whole=400")
+
+
 @pytest.mark.parametrize(
     ("value", "sets", "address", "after"),
     [
-        # The level cannot follow: offset by 30 of 20 neither, whole by 30 of 400 can.
-        (975, ("judge.level=1000", "many.offset=10"), "many.whole", 15),
-        (999.75, ("judge.level=1000",), "many.offset", 0.25),
-        (-395, ("judge.level=0", "many.free=-20"), "many.sign", "minus"),
-        (500, ("judge.level=1000", "many.offset=-10"), "many.double", True),
+        (3, (), "many.whole", 2),
+        (-396, ("many.whole=400",), "many.offset", 1.0),
+        (-407, AT_THEIR_ENDS, "many.double", True),
+        (-417, AT_THEIR_ENDS, "many.sign", "minus"),
+        (-387, (*AT_THEIR_ENDS, "many.free=-20"), "many.free", -18.0),
     ],
 )
 def test_every_kind_of_parameter_is_varied(
     value: float, sets: tuple[str, ...], address: str, after: Any
 ) -> None:
-    found = searched(Many, Judge, value=value, sets=sets)
+    found = searched(Many, Fixed, value=value, sets=sets)
     assert found.change is not None
-    if address in ("many.sign", "many.double", "many.offset", "many.whole"):
-        others = {"judge.level"}
-        assert found.change.address == address or found.change.address in others
-    if found.change.address == address:
-        assert found.change.after == after
+    assert (found.change.address, found.change.after) == (address, after)
+    assert found.change.verdict == "over"
 
 
 def test_only_values_of_the_range_are_tried_and_that_nothing_turns_is_told() -> None:
     found = searched(Many, Stubborn)
     assert found.change is None and found.complete and found.parameters == 7
     assert outcome(found).startswith("No change of one parameter within its range")
+
+
+class Moody(Judge):
+    """Over a level, its verdict is on something else."""
+
+    name = "moody"
+    gives = (Artifact("moody", "bool", "H W"),)
+
+    def compute(self, inputs: Mapping[str, Any], parameters: Any) -> dict[str, Any]:
+        return {"moody": inputs["total"] >= parameters.level}
+
+    def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        if artifacts["moody"][y, x]:
+            return [Finding("not asked any more", verdict="other", about="the neighbour")]
+        return [Finding("asked", verdict="under")]
+
+
+def test_a_verdict_on_something_else_turns_nothing_unless_it_was_asked_for() -> None:
+    assert searched(Many, Moody).change is None
+    asked = searched(Many, Moody, value=7, stage="moody")
+    assert asked.change is not None and asked.change.verdict == "under"
 
 
 def test_where_nothing_turns_the_last_verdict_an_earlier_one_is_turned() -> None:
@@ -303,7 +338,7 @@ def test_what_makes_no_difference_is_not_followed_downstream() -> None:
     run = pipeline.run(frame(np.full((2, 2), 3, np.float32)))
     from workbench.why import _Trials
 
-    trials = _Trials(pipeline, run, 1, 1, ["judge"], 99, lambda: None)
+    trials = _Trials(pipeline, run, 1, 1, ["judge"], ["judge"], 99, lambda: None)
     Judge.computed = 0
     assert trials.verdicts("many.unused", 0.5) == {"judge": "under"}
     assert Judge.computed == 0

@@ -8,7 +8,7 @@ the least change of one parameter that turns a stage's verdict on the pixel.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from types import MappingProxyType
 from typing import Any
@@ -204,7 +204,7 @@ def smallest_change(
 
     A verdict that turns and turns back within one such reach is not seen, so that a smaller change
     may exist; the one named is real: the whole pipeline was run with it.  A run in which the stage
-    fails, or has no verdict, turns nothing.
+    fails, or has no verdict (on this very pixel, if it had one on it), turns nothing.
 
     The time is bounded by ``budget`` runs, counted in what is returned; each recomputes only what
     is downstream of the change, and stops where it makes no difference any more.  Results are kept
@@ -221,7 +221,7 @@ def smallest_change(
     asked = [name for name in asked if name in told.verdicts]
     if not asked:
         return None
-    trials = _Trials(pipeline, run, x, y, asked, budget, before_each)
+    trials = _Trials(pipeline, run, x, y, asked, told.own, budget, before_each)
     axes = _axes(trials.pipeline, told)
     hits = {name: _Hits(name, told.verdicts[name]) for name in asked}
     complete = True
@@ -266,10 +266,11 @@ class _Trials:
         x: int,
         y: int,
         asked: list[str],
+        own: Collection[str],
         budget: int,
         before_each: Callable[[], None],
     ) -> None:
-        self._whole, self._base = pipeline, run
+        self._whole, self._base, self._own = pipeline, run, own
         self._x, self._y = x, y
         self._budget, self._before_each = budget, before_each
         self.runs = 0
@@ -284,7 +285,10 @@ class _Trials:
         self._asked = [self._stages[name] for name in stages]
 
     def verdicts(self, address: str, value: Any) -> dict[str, str]:
-        """The verdicts with this value at this address, of the asked stages that have one."""
+        """The verdicts with this value at this address, of the asked stages that have one.
+
+        A stage whose verdict was on this very pixel and is on something else now has none.
+        """
         try:
             settings = adjusted(self._stages, self.pipeline.settings, {address: value})
         except SettingsError:
@@ -302,7 +306,11 @@ class _Trials:
             for stage in self._asked
             if stage.name not in before
         )
-        return {one.stage: one.verdict for one in told if one.verdict}
+        return {
+            one.stage: one.deciding.verdict
+            for one in told
+            if one.deciding and not (one.deciding.about and one.stage in self._own)
+        }
 
     def _run(self, pipeline: Pipeline, owner: str) -> Run:
         """The frame through ``pipeline``, as far as anything differs from the run without change.
