@@ -153,6 +153,12 @@ def test_the_story_is_json() -> None:
     assert finding["threshold"] == {"parameter": "cut.level", "value": 5.0, "unit": "grey levels"}
 
 
+def test_without_an_image_there_is_no_pixel_to_ask_about() -> None:
+    pipeline = pipeline_of(CannotExplain)
+    with pytest.raises(UsageError, match="no recorded image"):
+        story(pipeline, pipeline.run(frame(RAMP)), 0, 0)
+
+
 @pytest.mark.parametrize(("x", "y"), [(-1, 0), (4, 0), (0, 3), (0, -1)])
 def test_a_pixel_outside_the_image_is_refused(x: int, y: int) -> None:
     pipeline = pipeline_of(Cut)
@@ -407,6 +413,26 @@ def test_stories_agree_where_something_rare_decided(session: Session, runs: list
         "region_features region", "region_features background", "recognition picked",
         "recognition refused", "recognition no candidate", "pose_frames pose",
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_stories_agree_with_other_presets_and_without_a_calibration(
+    scene: Path, tmp_path: Path, preset: str, calibrated: bool
+) -> None:
+    path = scene
+    if not calibrated:
+        path = tmp_path / "scene.mcap"
+        path.write_bytes(scene.read_bytes())
+    session = Session.open(Options(path, preset=preset, frames=(5, 6)))
+    random = np.random.default_rng(7)
+    for run in session.runs():
+        pixels = [*random.integers(256, size=(20, 2)).tolist(), *rare_pixels(run)]
+        for x, y in pixels:
+            told = story(session.pipeline, run, x, y)
+            assert disagreements(told, session.pipeline, run.artifacts) == [], (x, y)
+            depth = told.verdicts["depth_cloud"]
+            assert depth in ({"known", "unknown"} if calibrated else {"relative", "unknown"})
 
 
 def test_laws_notice_a_story_that_lies(session: Session, runs: list[Run]) -> None:

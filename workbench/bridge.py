@@ -19,7 +19,7 @@ from workbench.pipeline import Pipeline, Run, dependencies
 from workbench.report import RunReport
 from workbench.session import Session
 from workbench.stage import Logged, RecordedCamera, RecordedImage, Resource
-from workbench.why import image_size
+from workbench.why import grid_channel, image_size
 
 FRAME_TIMELINE = "frame"
 STAMP_TIMELINE = "stamp"
@@ -319,7 +319,7 @@ class Bridge:
     def _pictures_on_grid(self, run: Run) -> set[str]:
         """The pictures on which pixels are asked: recorded ones of other channels are not."""
         pipeline = self.session.pipeline
-        grid, own = image_size(pipeline, run), f"recorded/{pipeline.channels[0][0]}"
+        grid, own = image_size(pipeline, run), f"recorded/{grid_channel(pipeline, run)}"
         return {
             path
             for path, size in self._pictures.items()

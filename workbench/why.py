@@ -22,7 +22,7 @@ from workbench.stage import Finding, Knob, Stage, StageError
 
 __all__ = [
     "Change", "Search", "StageStory", "Story", "Threshold", "as_dict", "as_markdown",
-    "image_size", "outcome", "smallest_change", "story",
+    "grid_channel", "image_size", "outcome", "smallest_change", "story",
 ]  # fmt: skip
 
 DEFAULT_BUDGET = 600
@@ -94,9 +94,18 @@ class Story:
         return self.own[-1] if self.own else None
 
 
+def grid_channel(pipeline: Pipeline, run: Run) -> str:
+    """The recorded channel on whose pixels questions are asked: the first that is required."""
+    required, optional = pipeline.channels
+    there = [channel for channel in (*required, *optional) if channel in run.frame.images]
+    if not there:
+        raise UsageError("this run takes no recorded image, so there are no pixels to ask about")
+    return there[0]
+
+
 def image_size(pipeline: Pipeline, run: Run) -> tuple[int, int]:
-    """Width and height of the grid that pixels are asked on: the first required channel's."""
-    height, width = run.frame.images[pipeline.channels[0][0]].shape[:2]
+    """Width and height of that channel's image."""
+    height, width = run.frame.images[grid_channel(pipeline, run)].shape[:2]
     return width, height
 
 
@@ -548,11 +557,14 @@ def _percent(share: float) -> str:
 
 
 def as_markdown(story: Story, search: Search | None = None) -> str:
-    """The story as a page: each stage with its verdict, and a line for each finding.
+    """The story as a page: what is asked, then each stage with its verdict and its findings.
 
     With a ``search`` it ends with what that found.
     """
     lines = [f"## Pixel {story.x}, {story.y} of frame {story.index}"]
+    asked = next((one for one in story.stages if one.stage == story.subject), None)
+    if asked is not None and asked.deciding is not None:
+        lines += ["", f"`{asked.stage}` says **{asked.verdict}**: {asked.deciding.says}."]
     for told in story.stages:
         verdict = f": {told.verdict}" if told.verdict else ""
         lines += ["", f"**{told.stage}{verdict}**", ""]
