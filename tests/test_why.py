@@ -12,7 +12,7 @@ import pytest
 from story_laws import disagreements
 
 from workbench.errors import UsageError
-from workbench.pipeline import Pipeline, Run
+from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.recording import Frame
 from workbench.session import Options, Session
 from workbench.settings import resolve
@@ -351,6 +351,29 @@ def test_what_makes_no_difference_is_not_followed_downstream() -> None:
     assert trials.verdicts("many.offset", 9.0) == {"judge": "over"}
     assert Judge.computed == 1
     assert trials.verdicts("many.sign", "broken") == {}
+
+
+def test_what_is_upstream_of_a_change_does_not_run_again_even_if_nothing_is_kept() -> None:
+    class Costly(Stage):
+        """Counts how often it runs."""
+
+        name = "costly"
+        needs = (IMAGE,)
+        gives = (Artifact("total", "float32", "H W"),)
+        computed = 0
+
+        def compute(self, inputs: Mapping[str, Any], parameters: Any) -> dict[str, Any]:
+            type(self).computed += 1
+            return {"total": inputs["left_image"].astype(np.float32)}
+
+    stages = {kind.name: kind() for kind in (Costly, Judge)}
+    pipeline = Pipeline(stages, resolve(stages), store=ResultStore(0))
+    run = pipeline.run(frame(RAMP))
+    Costly.computed = 0
+    found = smallest_change(pipeline, run, 0, 0)
+    assert found is not None and found.runs > 5
+    # Once for the search, and once to verify what it found.
+    assert Costly.computed <= 2
 
 
 def test_a_stage_that_is_not_there_and_a_pixel_without_verdict() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from workbench.errors import UsageError, one_line
-from workbench.pipeline import Pipeline, Run
+from workbench.pipeline import DEFAULT_STORE_BYTES, Pipeline, ResultStore, Run
 from workbench.settings import SettingsError, adjusted
 from workbench.stage import Finding, Knob, Stage, StageError
 
@@ -217,7 +217,8 @@ def smallest_change(
 
     The time is bounded by ``budget`` runs, counted in what is returned; each recomputes only what
     is downstream of the change, and stops where it makes no difference any more.  Results are kept
-    in the pipeline's store.  ``before_each`` is called before each run and may raise to stop.
+    in the pipeline's store, or in one of the search's own where that is too small.
+    ``before_each`` is called before each run and may raise to stop.
 
     Returns None where there is no verdict on this pixel.  Raises :class:`UsageError` for a stage
     that the pipeline has not.
@@ -280,6 +281,10 @@ class _Trials:
         before_each: Callable[[], None],
     ) -> None:
         self._whole, self._base, self._own = pipeline, run, own
+        if pipeline.store.capacity_bytes < DEFAULT_STORE_BYTES:
+            # What is upstream of a change must be kept from run to run.
+            self._whole = pipeline.with_stages(pipeline.stages)
+            self._whole.store = ResultStore()
         self._x, self._y = x, y
         self._budget, self._before_each = budget, before_each
         self.runs = 0
