@@ -490,12 +490,16 @@ def _narrowed(hits: _Hits, trials: _Trials) -> Iterator[_Hit]:
         verdict = trials.verdicts(axis.address, value).get(hits.stage, hits.verdict)
         return None if verdict == hits.verdict else _Hit(axis, value, verdict)
 
-    # Already the least of the reach is an answer, if the budget ends here.
-    best = min((hit for hit, _, _ in hits.places), key=lambda hit: hit.share)
+    # The least first: those that cannot do with less than it are done after one run each.
+    places = sorted(hits.places, key=lambda place: place[0].share)
+    best = places[0][0]
+    # Already this is an answer, if the budget ends here.
     yield best
-    for widest, inside, outside in hits.places:
+    for widest, inside, outside in places:
         axis, way = widest.axis, 1 if outside > 0 else -1
-        hit, near, far = widest, abs(inside), abs(outside)
+        # A place beyond the range's end stands for the end.
+        far = min(abs(outside), axis.places(widest.share) + 1) if outside else 0
+        hit, near = widest, abs(inside)
         if hit.share > best.share:
             # Only what would be less than the best so far is of interest.
             limit = min(axis.places(best.share), far)
