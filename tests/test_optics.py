@@ -15,6 +15,7 @@ from stages.optics.analytic import (
     pattern_waves,
     plane_image,
     ratio,
+    shading,
 )
 from stages.optics.rig import Pattern, Projector, Rig
 from stages.optics.thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
@@ -149,3 +150,51 @@ def test_ratio_falls_from_the_near_to_the_far_plane() -> None:
     values = ratio(rig, depth)
     assert (np.diff(values) < 0).all()
     assert values[0] > 0.7 and values[-1] < -0.7
+
+
+def test_projector_is_sharp_where_its_axis_meets_the_cameras() -> None:
+    """Shifted by one period the pattern repeats; the focal plane goes through (0, 0, focus)."""
+    projector = Projector(position_mm=(30.0, -80.0, 5.0), angle_deg=10.0)
+    meeting = np.array([0.0, 0.0, projector.focus_mm])
+    np.testing.assert_allclose(projector.cycles(meeting), 0, atol=1e-9)
+    right, down, forward = projector.axes
+    np.testing.assert_allclose(projector.axes @ projector.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(projector.axes) == pytest.approx(1)
+    for point in (meeting, meeting + 20 * right, meeting - 30 * down):
+        assert projector.blur_mm(point) == pytest.approx(0, abs=1e-9)
+        # Counter-clockwise as displayed, with y down.
+        turn = np.deg2rad(10.0)
+        across = np.cos(turn) * right - np.sin(turn) * down
+        np.testing.assert_allclose(
+            projector.cycles(point + projector.period_mm * across) - projector.cycles(point),
+            [1, 0],
+            atol=1e-9,
+        )
+    behind = meeting + 50 * forward
+    expected = projector.aperture_mm * 50 / (projector.focal_plane_mm + 50)
+    assert projector.blur_mm(behind) == pytest.approx(expected)
+
+
+def test_irradiance_is_one_at_the_focus_distance_and_falls_with_its_square() -> None:
+    projector = Projector(position_mm=(0.0, 0.0, 0.0))
+    facing = np.array([0.0, 0.0, -1.0])
+    assert projector.irradiance(np.array([0, 0, 750.0]), facing) == pytest.approx(1)
+    assert projector.irradiance(np.array([0, 0, 1500.0]), facing) == pytest.approx(0.25)
+    assert projector.irradiance(np.array([0, 0, 750.0]), -facing) == 0
+    oblique = np.array([750.0, 0, 750.0])  # 45°: both cosines, and √2 as far
+    assert projector.irradiance(oblique, facing) == pytest.approx(0.25)
+
+
+def test_analytic_plane_against_a_ray_traced_one() -> None:
+    """A recorded plane, with the pattern turned and its own magnification for each sensor."""
+    recording = Recording.open(SCENE.with_name("unregistered.mcap"))
+    rig = Rig.from_metadata(recording.rig)
+    frames = recording.frames(["near", "far"])
+    plane = next(f for f in frames if f.truth and f.truth.meta.get("z") == 733.0)
+    for channel in ("near", "far"):
+        projected, sky = shading(rig, channel, 733.0)
+        light = 0.78 * (plane_image(rig, channel, 733.0) * projected + sky)
+        middle = (slice(64, 192), slice(64, 192))  # the rest is vignetted
+        error = plane.images[channel][middle] / 255 - light[middle]
+        assert np.sqrt((error**2).mean()) < 0.02  # mostly noise of sensor and ray tracer
+        assert abs(error.mean()) < 0.003

@@ -3,7 +3,7 @@
 A periodic pattern is a sum of plane waves.  Defocus of a lens with a round aperture multiplies
 each wave by the transfer of a uniform disc, 2 J1(π c) / (π c) with c = diameter × frequency; so do
 the projector's defocus and, with a sinc, the square pixel.  A pixel's value is the sum of the waves
-that are left, exact for a thin lens at any sampling.
+that are left.
 
 Valid for a plane at one depth, seen whole: no edges, no shadows, no light from elsewhere.
 """
@@ -88,39 +88,49 @@ def plane_image(rig: Rig, channel: Channel, depth_mm: float) -> np.ndarray:
     if rig.projector is None:
         raise ValueError("the rig has no projector, hence no pattern on a plane")
     projector = rig.projector
-    focal = rig.focal_px(channel)
-    # One pixel of the image in the projector's focal plane; both look along z.
-    forward = depth_mm - projector.position_mm[2]
-    to_focal_plane = projector.focus_mm / forward
-    px_mm = depth_mm / focal * to_focal_plane
-    left_mm, top_mm = (
-        projector.position_mm[axis]
-        + (-rig.centre_px[axis] * depth_mm / focal - projector.position_mm[axis]) * to_focal_plane
-        for axis in (0, 1)
+    x, y = np.meshgrid(
+        (np.arange(rig.width_px) - rig.centre_px[0]) / rig.focal_px(channel),
+        (np.arange(rig.height_px) - rig.centre_px[1]) / rig.focal_px(channel),
     )
-    lens_mm = abs(float(rig.blur_px(channel, depth_mm))) * px_mm
-    projector_mm = float(projector.blur_mm(depth_mm))
-    turn = np.deg2rad(projector.angle_deg)
-    across = np.array([np.cos(turn), -np.sin(turn)]) / projector.period_mm
-    along = np.array([np.sin(turn), np.cos(turn)]) / projector.period_mm
-    x_mm = left_mm + px_mm * np.arange(rig.width_px)
-    y_mm = top_mm + px_mm * np.arange(rig.height_px)
-    image = np.full((rig.height_px, rig.width_px), pattern_mean(projector.pattern))
+    points_mm = depth_mm * np.stack([x, y, np.ones_like(x)], axis=-1)
+    cycles = projector.cycles(points_mm)
+    # Blur and pixel in the middle of the image; both change by a percent towards its corners.
+    middle_mm = np.array([0, 0, depth_mm])
+    px_mm = depth_mm / rig.focal_px(channel)
+    step = projector.cycles(middle_mm + px_mm * np.eye(3)[:2]) - projector.cycles(middle_mm)
+    lens_px = abs(float(rig.blur_px(channel, depth_mm)))
+    projector_mm = float(projector.blur_mm(middle_mm))
+    image = np.full(x.shape, pattern_mean(projector.pattern))
     for m, n, amplitude in pattern_waves(projector.pattern):
-        wave = m * across + n * along  # cycles per millimetre of the focal plane
-        frequency = float(np.hypot(*wave))
+        per_px = step @ (m, n)  # cycles per pixel, in x and y
         transfer = (
-            disc_transfer(lens_mm * frequency)
-            * disc_transfer(projector_mm * frequency)
-            * np.sinc(wave[0] * px_mm)
-            * np.sinc(wave[1] * px_mm)
+            disc_transfer(lens_px * float(np.hypot(*per_px)))
+            * disc_transfer(projector_mm * float(np.hypot(m, n)) / projector.period_mm)
+            * np.sinc(per_px[0])
+            * np.sinc(per_px[1])
         )
         if abs(amplitude * transfer) < _NEGLIGIBLE:
             continue
-        columns = 2 * amplitude * transfer * np.exp(2j * np.pi * wave[0] * x_mm)
-        rows = np.exp(2j * np.pi * wave[1] * y_mm)
-        image += rows.real[:, None] * columns.real - rows.imag[:, None] * columns.imag
+        image += 2 * (amplitude * transfer * np.exp(2j * np.pi * (cycles @ (m, n)))).real
     return image
+
+
+def shading(rig: Rig, channel: Channel, depth_mm: float, sky: float = 0.02) -> np.ndarray:
+    """Light of the open projector and of the camera's cos⁴ over a plane, float64 [H W].
+
+    The image of a plane of albedo a is a × (:func:`plane_image` × first + second) of what is given:
+    an array [2 H W], the projector's share and the ``sky``'s.
+    """
+    if rig.projector is None:
+        raise ValueError("the rig has no projector, hence no light on a plane")
+    x, y = np.meshgrid(
+        (np.arange(rig.width_px) - rig.centre_px[0]) / rig.focal_px(channel),
+        (np.arange(rig.height_px) - rig.centre_px[1]) / rig.focal_px(channel),
+    )
+    points_mm = depth_mm * np.stack([x, y, np.ones_like(x)], axis=-1)
+    falloff = (1 + x**2 + y**2) ** -2
+    light = rig.projector.irradiance(points_mm, np.array([0.0, 0.0, -1.0]))
+    return np.stack([light * falloff, sky * falloff])
 
 
 def ratio(rig: Rig, depth_mm: np.ndarray) -> np.ndarray:

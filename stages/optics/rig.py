@@ -42,7 +42,11 @@ _CONFIG = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Projector(pydantic.BaseModel):
-    """A grating imaged onto the scene by a lens of its own, its axis parallel to the camera's."""
+    """A grating imaged onto the scene by a lens of its own.
+
+    Its axis meets the camera's at depth ``focus_mm``; there lies its focal plane, square to its own
+    axis, in which the pattern is sharp and its irradiance is 1.
+    """
 
     model_config = _CONFIG
 
@@ -76,10 +80,53 @@ class Projector(pydantic.BaseModel):
         grating_mm = image_distance_mm(self.focal_length_mm, self.focus_mm)
         return self.focus_mm / grating_mm / self.lines_per_mm
 
-    def blur_mm(self, depth_mm: np.ndarray | float) -> np.ndarray:
-        """Diameter of a pattern point's blur at ``depth_mm``, measured in the focal plane."""
-        forward = np.asarray(depth_mm, float) - self.position_mm[2]
-        return self.aperture_mm * np.abs(1 - self.focus_mm / forward)
+    @property
+    def focal_plane_mm(self) -> float:
+        """Distance of the focal plane from the projector's lens, along its axis."""
+        return float(np.linalg.norm(np.array([0, 0, self.focus_mm]) - self.position_mm))
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Rows: the projector's x (right), y (down) and z (forward) in the camera's frame, 3 3."""
+        forward = (np.array([0, 0, self.focus_mm]) - self.position_mm) / self.focal_plane_mm
+        right = np.array([1.0, 0.0, 0.0]) - forward[0] * forward
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+    @property
+    def pattern_axes(self) -> np.ndarray:
+        """Rows: across and along the stripes in the focal plane, in cycles per millimetre, 2 3."""
+        turn = np.deg2rad(self.angle_deg)
+        right, down = self.axes[:2] / self.period_mm
+        return np.stack(
+            [
+                np.cos(turn) * right - np.sin(turn) * down,
+                np.sin(turn) * right + np.cos(turn) * down,
+            ]
+        )
+
+    def cycles(self, points_mm: np.ndarray) -> np.ndarray:
+        """Where the light at points [... 3] crosses the focal plane, in periods [... 2]."""
+        from_lens = points_mm - np.asarray(self.position_mm)
+        forward = from_lens @ self.axes[2]
+        return from_lens @ self.pattern_axes.T * (self.focal_plane_mm / forward)[..., None]
+
+    def blur_mm(self, points_mm: np.ndarray) -> np.ndarray:
+        """Diameter of the pattern's blur at points [... 3], measured in the focal plane."""
+        forward = (points_mm - np.asarray(self.position_mm)) @ self.axes[2]
+        return self.aperture_mm * np.abs(1 - self.focal_plane_mm / forward)
+
+    def irradiance(self, points_mm: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Light of the open projector on surfaces at points [... 3] with unit normals [... 3].
+
+        Inverse square and both cosines, 1 at the distance ``focus_mm`` on its axis; 0 on surfaces
+        turned away.
+        """
+        from_lens = points_mm - np.asarray(self.position_mm)
+        distance = np.linalg.norm(from_lens, axis=-1)
+        leaving = np.clip(from_lens @ self.axes[2], 0, None) / distance
+        arriving = np.clip(-(from_lens * normals).sum(-1), 0, None) / distance
+        return (self.focus_mm / distance) ** 2 * leaving * arriving
 
 
 class Rig(pydantic.BaseModel):
@@ -186,7 +233,8 @@ class Rig(pydantic.BaseModel):
             values["projector"] = {
                 "pattern": _PATTERN_NAMES[pattern],
                 "lines_per_mm": number("grating"),
-                "angle_deg": number("pat_angle", 0.0),
+                # The record's angle counts clockwise as displayed, with y down.
+                "angle_deg": -number("pat_angle", 0.0),
                 "focus_mm": number("proj_u"),
                 "focal_length_mm": number("proj_f", number("f")),
                 "f_number": number("proj_Fno"),
@@ -234,7 +282,7 @@ class Rig(pydantic.BaseModel):
             values |= {
                 "pattern": _METADATA_NAMES.get(self.projector.pattern, self.projector.pattern),
                 "grating": self.projector.lines_per_mm,
-                "pat_angle": self.projector.angle_deg,
+                "pat_angle": 0.0 - self.projector.angle_deg,
                 "proj_u": self.projector.focus_mm,
                 "proj_f": self.projector.focal_length_mm,
                 "proj_Fno": self.projector.f_number,
@@ -330,9 +378,9 @@ class Rig(pydantic.BaseModel):
         return self.blur_mm(channel, depth_mm) * scale
 
     def period_px(self, channel: Channel) -> float:
-        """Period of the pattern in an image, the same at all depths.  Raises without a projector.
+        """Period of the pattern in the middle of an image.  Raises without a projector.
 
-        Camera and projector look in one direction, so that both magnify with 1 / depth.
+        It hardly changes with depth, because camera and projector both magnify with 1 / depth.
         """
         if self.projector is None:
             raise ValueError("the rig has no projector, hence no period")
