@@ -15,6 +15,7 @@ from stages.artifacts import (
     FAR,
     FOCUS_FAR,
     FOCUS_NEAR,
+    FOCUS_NOISE,
     INTENSITY,
     NEAR,
     NEAR_CAMERA,
@@ -54,6 +55,7 @@ class DepthCloud(Stage):
     needs = (
         FOCUS_NEAR,
         FOCUS_FAR,
+        FOCUS_NOISE,
         NEAR,
         FAR,
         INTENSITY,
@@ -94,6 +96,15 @@ class DepthCloud(Stage):
             step=0.1,
             unit="% of working range",
         )
+        texture_half_confidence_error_percent: float = knob(
+            12.0,
+            "The same where depth comes from the scene's own texture and the optics alone: what "
+            "lies in a window differs from place to place, and so does its blur.",
+            low=0.2,
+            high=100,
+            step=0.5,
+            unit="% of working range",
+        )
         min_confidence: float = knob(
             0.5,
             "Depth of less confidence than this is given as unknown.",
@@ -122,6 +133,8 @@ class DepthCloud(Stage):
     presets = {"paper": {"edge_aware": False, "smoothing_periods": 0.2, "min_confidence": 0.1}}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+        from dataclasses import replace
+
         import cv2
         import numpy as np
 
@@ -131,8 +144,13 @@ class DepthCloud(Stage):
 
         calibration, stripes = inputs["calibration"], inputs["stripes"]
         near, far = inputs["near"], inputs["far"]
-        period_px = stripes.extent_px() if stripes is not None else _WINDOW_WITHOUT_STRIPES_PX
+        texture = calibration.texture if calibration is not None else None
+        scale_px = texture.scale_px if texture is not None else 1
+        period_px = _WINDOW_WITHOUT_STRIPES_PX if stripes is None else stripes.extent_px()
+        period_px *= scale_px
         windows = dfd.windows_for(period_px, parameters.smoothing_periods, parameters.reach_periods)
+        # The pixels of an image that was shrunk are all the independent samples that there are.
+        windows = replace(windows, samples=max(1.0, windows.samples / scale_px**2))
         taps = whole_period_taps(min(period_px, *near.shape))
         brightness = cv2.sepFilter2D(
             near + far, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
@@ -140,9 +158,9 @@ class DepthCloud(Stage):
         if calibration is not None:
             response = dfd.Response(
                 calibration.curve,
-                calibration.modulation,
+                calibration.modulation if calibration.modulation.size else None,
                 calibration.slope,
-                calibration.noise,
+                inputs["focus_noise"],
                 calibration.laplacian,
             )
         else:
@@ -157,7 +175,10 @@ class DepthCloud(Stage):
             parameters.edge_aware,
         )
         confidence = dfd.confidence_from_error(
-            error_percent, parameters.half_confidence_error_percent
+            error_percent,
+            parameters.half_confidence_error_percent
+            if texture is None
+            else parameters.texture_half_confidence_error_percent,
         )
         if inputs["saturated"].any():
             share = cv2.blur(
@@ -172,7 +193,7 @@ class DepthCloud(Stage):
             | (relative > 1 + margin)
         )
         relative[unknown] = np.nan
-        if calibration is not None:
+        if calibration is not None and calibration.modulation.size:
             folded = dfd.folded_back(
                 inputs["focus_near"] + inputs["focus_far"],
                 brightness,
