@@ -1,0 +1,261 @@
+"""The compiled loops of the ray tracer: rays that leave the lens, and the light that they find.
+
+Open3D finds what a ray hits; everything before and after is here.  A pixel's samples depend on the
+seed, the pixel and the number of the sample, never on the order in which pixels are worked on, so
+that any number of threads gives the same image.  Lengths are millimetres in the camera's frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+_compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
+
+_NUDGE_MM = 0.01
+"""How far rays start above the surface that they leave."""
+
+
+@_compiled
+def _shift(seed, pixel, dimension):  # type: ignore[no-untyped-def]
+    """A hash of three numbers as a float in [0, 1): how a pixel's samples are turned."""
+    state = np.uint32(seed) * np.uint32(747796405) + np.uint32(2891336453)
+    for value in (pixel, dimension):
+        state = (state ^ np.uint32(value)) * np.uint32(2654435769)
+        state ^= state >> np.uint32(15)
+        state *= np.uint32(2246822519)
+        state ^= state >> np.uint32(13)
+        state *= np.uint32(3266489917)
+        state ^= state >> np.uint32(16)
+    return state * 2.3283064365386963e-10
+
+
+@_compiled
+def _on_disc(a, b):  # type: ignore[no-untyped-def]
+    """A point of the unit disc from a point of the unit square, area kept (Shirley and Chiu)."""
+    x, y = 2 * a - 1, 2 * b - 1
+    if x == 0 and y == 0:
+        return 0.0, 0.0
+    if abs(x) > abs(y):
+        radius, angle = x, math.pi / 4 * (y / x)
+    else:
+        radius, angle = y, math.pi / 2 - math.pi / 4 * (x / y)
+    return radius * math.cos(angle), radius * math.sin(angle)
+
+
+@_compiled
+def lens_rays(rays, weights, samples, seed, first, width, camera):  # type: ignore[no-untyped-def]
+    """Rays from the lens through what pixels are focused on.
+
+    ``rays`` [P S 6] float32 (origin, direction with z = 1, so that a ray's parameter is depth) and
+    ``weights`` [P S] (0 where the stop cuts a ray) are filled for the pixels from ``first`` on.
+    ``samples`` [S 6] are points of the unit cube: pixel, lens, projector.  ``camera`` is centre x
+    and y, focal length, a 2 3 matrix from the pixel to the ideal one, focus, aperture's radius,
+    stop's distance and radius.
+    """
+    for p in range(rays.shape[0]):
+        pixel = first + p
+        x, y = pixel % width, pixel // width
+        s0, s1 = _shift(seed, pixel, 0), _shift(seed, pixel, 1)
+        s2, s3 = _shift(seed, pixel, 2), _shift(seed, pixel, 3)
+        for s in range(samples.shape[0]):
+            px = x - 0.5 + (samples[s, 0] + s0) % 1
+            py = y - 0.5 + (samples[s, 1] + s1) % 1
+            qx = camera[3] * px + camera[4] * py + camera[5]
+            qy = camera[6] * px + camera[7] * py + camera[8]
+            u, v = _on_disc((samples[s, 2] + s2) % 1, (samples[s, 3] + s3) % 1)
+            ox, oy = u * camera[10], v * camera[10]
+            dx = (qx - camera[0]) / camera[2] - ox / camera[9]
+            dy = (qy - camera[1]) / camera[2] - oy / camera[9]
+            rays[p, s, 0], rays[p, s, 1], rays[p, s, 2] = ox, oy, 0.0
+            rays[p, s, 3], rays[p, s, 4], rays[p, s, 5] = dx, dy, 1.0
+            passes = True
+            if camera[12] > 0:
+                passes = math.hypot(ox + dx * camera[11], oy + dy * camera[11]) < camera[12]
+            weights[p, s] = 1.0 if passes else 0.0
+
+
+@_compiled
+def _hit(ray, depth):  # type: ignore[no-untyped-def]
+    return ray[0] + depth * ray[3], ray[1] + depth * ray[4], ray[2] + depth * ray[5]
+
+
+@_compiled
+def _facing(normal, ray):  # type: ignore[no-untyped-def]
+    """The side of a surface that a ray sees."""
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    if nx * ray[3] + ny * ray[4] + nz * ray[5] > 0:
+        return -nx, -ny, -nz
+    return nx, ny, nz
+
+
+@_compiled
+def shadow_rays(out, rays, t, triangle, normals, samples, seed, first, projector):  # type: ignore[no-untyped-def]
+    """Rays from what was hit to points of the projector's aperture, their parameter 0 to 1.
+
+    ``out`` is like ``rays`` [P S 6].  Surfaces turned away get a ray that leaves the scene; their
+    irradiance is 0 in any case.  ``projector`` is its position, x and y axis, aperture's radius.
+    """
+    for p in range(rays.shape[0]):
+        s4, s5 = _shift(seed, first + p, 4), _shift(seed, first + p, 5)
+        for s in range(rays.shape[1]):
+            out[p, s, :] = 0
+            out[p, s, 2] = -1e6
+            out[p, s, 5] = -1.0
+            if triangle[p, s] < 0:
+                continue
+            u, v = _on_disc((samples[s, 4] + s4) % 1, (samples[s, 5] + s5) % 1)
+            u, v = u * projector[9], v * projector[9]
+            x, y, z = _hit(rays[p, s], t[p, s])
+            nx, ny, nz = _facing(normals[triangle[p, s]], rays[p, s])
+            dx = projector[0] + u * projector[3] + v * projector[6] - x
+            dy = projector[1] + u * projector[4] + v * projector[7] - y
+            dz = projector[2] + u * projector[5] + v * projector[8] - z
+            if nx * dx + ny * dy + nz * dz > 0:
+                out[p, s, 0] = x + _NUDGE_MM * nx
+                out[p, s, 1] = y + _NUDGE_MM * ny
+                out[p, s, 2] = z + _NUDGE_MM * nz
+                out[p, s, 3], out[p, s, 4], out[p, s, 5] = dx, dy, dz
+
+
+@_compiled
+def _irradiance(x, y, z, nx, ny, nz, light):  # type: ignore[no-untyped-def]
+    """Open projector's light at a point: both cosines, inverse square; 0 where turned away.
+
+    ``light`` is position (3), axis (3), focus distance, distance of the focal plane, across (3) and
+    along (3) the stripes in cycles per millimetre, aperture's diameter.
+    """
+    dx, dy, dz = x - light[0], y - light[1], z - light[2]
+    square = dx * dx + dy * dy + dz * dz
+    arriving = -(dx * nx + dy * ny + dz * nz)
+    leaving = dx * light[3] + dy * light[4] + dz * light[5]
+    if arriving <= 0 or leaving <= 0:
+        return 0.0
+    return light[6] * light[6] * arriving * leaving / (square * square)
+
+
+@_compiled
+def _pattern(x, y, z, light, table, table_step):  # type: ignore[no-untyped-def]
+    """Transmission of the pattern at a point, blurred by the projector's defocus there."""
+    dx, dy, dz = x - light[0], y - light[1], z - light[2]
+    forward = dx * light[3] + dy * light[4] + dz * light[5]
+    scale = light[7] / forward
+    u = (dx * light[8] + dy * light[9] + dz * light[10]) * scale
+    v = (dx * light[11] + dy * light[12] + dz * light[13]) * scale
+    levels, height, width = table.shape
+    at = min(light[14] * abs(1 - scale) / table_step, levels - 1.001)
+    a = (u - math.floor(u)) * width
+    b = (v - math.floor(v)) * height
+    k, i, j = int(at), int(a) % width, int(b) % height
+    fk, fi, fj = at - k, a - int(a), b - int(b)
+    i1, j1 = (i + 1) % width, (j + 1) % height
+    value = 0.0
+    for level, weight in ((k, 1 - fk), (k + 1, fk)):
+        row = (1 - fi) * table[level, j, i] + fi * table[level, j, i1]
+        next_row = (1 - fi) * table[level, j1, i] + fi * table[level, j1, i1]
+        value += weight * ((1 - fj) * row + fj * next_row)
+    return value
+
+
+@_compiled
+def gather(
+    striped,
+    plain,
+    rays,
+    weights,
+    t,
+    triangle,
+    shadowed,
+    normals,
+    albedo,
+    face,
+    light,
+    table,
+    table_step,
+    pinhole,
+    ambient_face,
+    ambient,
+    ambient_of_face,
+):  # type: ignore[no-untyped-def]
+    """Mean light of each pixel's rays: with the pattern, and with the projector open, [P].
+
+    ``normals`` [T 3], ``albedo`` [T] and ``face`` [T] are by triangle; ``ambient`` [H W] is the
+    light from elsewhere by pixel of the ``pinhole`` (focal length, centre x, y) that sees
+    ``ambient_face`` [H W], and ``ambient_of_face`` [F] stands in where it does not see a face.
+    """
+    height, width = ambient.shape
+    for p in range(rays.shape[0]):
+        with_pattern, without = 0.0, 0.0
+        for s in range(rays.shape[1]):
+            k = triangle[p, s]
+            if k < 0 or weights[p, s] == 0:
+                continue
+            x, y, z = _hit(rays[p, s], t[p, s])
+            nx, ny, nz = _facing(normals[k], rays[p, s])
+            # Light from elsewhere changes slowly: what a nearby pixel of the same face gets.
+            i = int(round(pinhole[0] * x / z + pinhole[1]))
+            j = int(round(pinhole[0] * y / z + pinhole[2]))
+            i = min(max(i, 0), width - 1)
+            j = min(max(j, 0), height - 1)
+            other = ambient_of_face[face[k]]
+            if ambient_face[j, i] == face[k]:
+                other = ambient[j, i]
+            else:
+                nearest = 1000
+                for jj in range(max(j - 2, 0), min(j + 3, height)):
+                    for ii in range(max(i - 2, 0), min(i + 3, width)):
+                        apart = (ii - i) ** 2 + (jj - j) ** 2
+                        if ambient_face[jj, ii] == face[k] and apart < nearest:
+                            nearest = apart
+                            other = ambient[jj, ii]
+            direct, patterned = 0.0, 0.0
+            if not shadowed[p, s]:
+                direct = _irradiance(x, y, z, nx, ny, nz, light)
+                if direct > 0:
+                    patterned = direct * _pattern(x, y, z, light, table, table_step)
+            with_pattern += albedo[k] * (patterned + other)
+            without += albedo[k] * (direct + other)
+        striped[p] = with_pattern / rays.shape[1]
+        plain[p] = without / rays.shape[1]
+
+
+@_compiled
+def hemisphere_rays(out, points, normals, samples, seed, first):  # type: ignore[no-untyped-def]
+    """Cosine-weighted rays from ``points`` [P 3] about ``normals`` [P 3]: ``out`` [P S 6].
+
+    Points that are not finite get rays that leave the scene.
+    """
+    for p in range(points.shape[0]):
+        s0, s1 = _shift(seed, first + p, 6), _shift(seed, first + p, 7)
+        nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
+        # Any two directions in the surface (Duff and others, 2017).
+        sign = 1.0 if nz >= 0 else -1.0
+        a = -1 / (sign + nz)
+        b = nx * ny * a
+        for s in range(samples.shape[0]):
+            u, v = _on_disc((samples[s, 0] + s0) % 1, (samples[s, 1] + s1) % 1)
+            w = math.sqrt(max(0.0, 1 - u * u - v * v))
+            out[p, s, 0] = points[p, 0] + _NUDGE_MM * nx
+            out[p, s, 1] = points[p, 1] + _NUDGE_MM * ny
+            out[p, s, 2] = points[p, 2] + _NUDGE_MM * nz
+            out[p, s, 3] = u * (1 + sign * nx * nx * a) + v * b + w * nx
+            out[p, s, 4] = u * sign * b + v * (sign + ny * ny * a) + w * ny
+            out[p, s, 5] = u * -sign * nx + v * -ny + w * nz
+
+
+@_compiled
+def gather_ambient(out, rays, t, triangle, shadowed, normals, albedo, light, sky, bounce):  # type: ignore[no-untyped-def]
+    """Sky and one diffuse bounce of the projector's mean light, as seen along rays: ``out`` [P]."""
+    for p in range(rays.shape[0]):
+        total = 0.0
+        for s in range(rays.shape[1]):
+            k = triangle[p, s]
+            if k < 0:
+                total += sky
+            elif bounce > 0 and not shadowed[p, s]:
+                x, y, z = _hit(rays[p, s], t[p, s])
+                nx, ny, nz = _facing(normals[k], rays[p, s])
+                total += bounce * albedo[k] * _irradiance(x, y, z, nx, ny, nz, light)
+        out[p] = total / rays.shape[1]

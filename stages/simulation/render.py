@@ -1,0 +1,391 @@
+"""The bifocal sensor's images of a scene by ray tracing, and the ground truth that goes with them.
+
+A pixel is the mean over rays from points of its area through points of the lens (a thin lens: all
+rays of a pixel point meet at its focus), both focus settings with one set of points.  Where a ray
+ends, a ray to a point of the projector's aperture finds shadow; the pattern that arrives is
+averaged over the aperture in closed form, so that its defocus carries no noise of sampling.  Where
+the aperture is half hidden that average is the whole aperture's, which blurs the stripes of a
+penumbra (less than a pixel wide) a little too much.  Sky and one diffuse bounce are gathered once
+for each pixel, as a pinhole sees the scene, and shared by the rays that end on the same face
+nearby.  Surfaces are Lambertian; the image falls off with cos⁴.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from stages.optics.analytic import disc_transfer, pattern_mean, pattern_value
+from stages.optics.rig import CHANNELS, Channel, Pattern, Projector, Rig
+from stages.simulation import rays
+from stages.simulation.bodies import Body
+from workbench.errors import DataError
+
+_RAYS_AT_ONCE = 1 << 19
+_PATTERN_CELLS = {"stripes": (1, 1024), "sine": (1, 256), "none": (1, 1)}
+_BLUR_LEVELS = 96
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What lights the scene beside the pattern, all relative to the projector's focal plane."""
+
+    sky: float = 0.02
+    """Light of an unobstructed sky, as a fraction of the open projector's."""
+    bounce: float = 1.0
+    """Strength of the one diffuse bounce; 1 is physical, 0 none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Light and truth of one frame.
+
+    ``light`` maps near, far and flat (projector open, near focus) to float64 [H W]: albedo ×
+    irradiance, 1 for white facing the projector at its focus.  ``depth_mm`` is float64 [H W], z
+    along the axis through pixel centres, NaN where nothing is; ``instances`` and ``faces`` are
+    uint8 [H W].
+    """
+
+    light: dict[str, np.ndarray]
+    depth_mm: np.ndarray
+    instances: np.ndarray
+    faces: np.ndarray
+
+
+def render(
+    rig: Rig,
+    bodies: Sequence[Body],
+    lighting: Lighting | None = None,
+    paths: int = 128,
+    seed: int = 0,
+    workers: int | None = None,
+) -> Rendering:
+    """Ray trace ``bodies``.  The same arrays whatever the number of ``workers`` (default: cores).
+
+    ``paths`` is the number of rays for each pixel and image, a power of two.  Raises
+    :class:`DataError` for a body that reaches the lens, and for a rig without a projector.
+    """
+    _require_in_front(rig, bodies)
+    with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
+        return _Tracer(rig, bodies, lighting or Lighting(), paths, seed, pool).rendering()
+
+
+def _require_in_front(rig: Rig, bodies: Sequence[Body]) -> None:
+    """Everything has to stand farther off than the lens's focal length, where images are real."""
+    for body in bodies:
+        if body.instance == 0 or len(body.mesh.triangles) < 3:
+            nearest = float(body.camera_from_object[2, 3])  # planes reach anywhere but to the lens
+        else:
+            nearest = float(body.vertices_mm[:, 2].min())
+        if nearest <= rig.focal_length_mm:
+            raise DataError(
+                f"{body.name} (object {body.instance}) reaches to {nearest:.1f} mm from the lens: "
+                f"expected it beyond the focal length, {rig.focal_length_mm:g} mm"
+            )
+
+
+class _Tracer:
+    """One frame's scene, ready to be hit by rays."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        bodies: Sequence[Body],
+        lighting: Lighting,
+        paths: int,
+        seed: int,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        import open3d as o3d
+
+        self.rig, self.lighting, self.paths, self.seed = rig, lighting, paths, seed
+        self._pool = pool
+        self._tensor = o3d.core.Tensor
+        self._scene = o3d.t.geometry.RaycastingScene()
+        self._none = np.uint32(self._scene.INVALID_ID)
+        firsts, first_face, normals, albedo, faces, instances, groups = [], 0, [], [], [], [], []
+        count = 0
+        for body in bodies:
+            self._scene.add_triangles(
+                self._tensor(body.vertices_mm.astype(np.float32)),
+                self._tensor(body.mesh.triangles.astype(np.uint32)),
+            )
+            firsts.append(count)
+            count += len(body.mesh.triangles)
+            normals.append(body.mesh.normals @ body.camera_from_object[:3, :3].T)
+            albedo.append(np.full(len(body.mesh.triangles), body.albedo))
+            groups.append(body.mesh.faces)
+            faces.append(body.mesh.faces + first_face)
+            first_face += int(body.mesh.faces.max()) + 1
+            instances.append(np.full(len(body.mesh.triangles), body.instance))
+        self._first_triangle = np.array(firsts, np.int64)
+        self._normals = np.concatenate(normals)
+        self._albedo = np.concatenate(albedo)
+        self._face = np.concatenate(faces).astype(np.int32)
+        self._face_count = first_face
+        self._group = np.concatenate(groups)
+        self._instance = np.concatenate(instances)
+
+    def _in_parts(self, size: int, rays_each: int, work: Callable[[slice], None]) -> None:
+        """``work`` on parts of ``size`` pixels, each part by itself, on the pool's threads."""
+        step = max(_RAYS_AT_ONCE // rays_each, 1)
+        parts = [slice(first, min(first + step, size)) for first in range(0, size, step)]
+        for _ in self._pool.map(work, parts):
+            pass
+
+    # -- rays -------------------------------------------------------------------------------------
+
+    def _cast(self, bundle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Parameter and triangle (-1 for none) of what rays [P S 6] hit, each [P S]."""
+        found = self._scene.cast_rays(self._tensor.from_numpy(bundle))
+        geometry = found["geometry_ids"].numpy()
+        hit = geometry != self._none
+        first = self._first_triangle[np.where(hit, geometry, 0)]
+        triangle = np.where(hit, first + found["primitive_ids"].numpy(), -1).astype(np.int32)
+        return found["t_hit"].numpy(), triangle
+
+    def _occluded(self, bundle: np.ndarray) -> np.ndarray:
+        return self._scene.test_occlusions(
+            self._tensor.from_numpy(bundle), tnear=0.0, tfar=1.0
+        ).numpy()
+
+    @cached_property
+    def _samples(self) -> np.ndarray:
+        return _points(self.paths, 6)
+
+    # -- truth ------------------------------------------------------------------------------------
+
+    @cached_property
+    def _pinhole(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Depth, triangle and points of what the pixel centres see: [H W], [H W], [H W 3]."""
+        rig = self.rig
+        focal = rig.focal_px("near")
+        x, y = np.meshgrid(
+            (np.arange(rig.width_px) - rig.centre_px[0]) / focal,
+            (np.arange(rig.height_px) - rig.centre_px[1]) / focal,
+        )
+        directions = np.stack([x, y, np.ones_like(x)], -1)
+        bundle = np.zeros((*x.shape, 6), np.float32)
+        bundle[..., 3:] = directions
+        depth, triangle = self._cast(bundle)
+        return depth.astype(float), triangle, directions * depth[..., None]
+
+    def rendering(self) -> Rendering:
+        depth, triangle, _ = self._pinhole
+        seen = triangle >= 0
+        light = {}
+        for channel in CHANNELS:
+            striped, plain = self._image(channel)
+            light[channel] = striped
+            if channel == "near":
+                light["flat"] = plain
+        groups = np.minimum(self._group, 255)
+        return Rendering(
+            light,
+            np.where(seen, depth, np.nan),
+            np.where(seen, self._instance[triangle], 0).astype(np.uint8),
+            np.where(seen, groups[triangle], 0).astype(np.uint8),
+        )
+
+    # -- light ------------------------------------------------------------------------------------
+
+    @cached_property
+    def _light(self) -> np.ndarray:
+        projector = self._projector
+        return np.concatenate(
+            [
+                projector.position_mm,
+                projector.axes[2],
+                [projector.focus_mm, projector.focal_plane_mm],
+                projector.pattern_axes.ravel(),
+                [projector.aperture_mm],
+            ]
+        )
+
+    @cached_property
+    def _aperture(self) -> np.ndarray:
+        projector = self._projector
+        axes = projector.axes[:2].ravel()
+        return np.concatenate([projector.position_mm, axes, [projector.aperture_mm / 2]])
+
+    @property
+    def _projector(self) -> Projector:
+        if self.rig.projector is None:
+            raise DataError("expected a projector in the rig: nothing else lights the scene")
+        return self.rig.projector
+
+    def _shadow(
+        self,
+        bundle: np.ndarray,
+        t: np.ndarray,
+        triangle: np.ndarray,
+        samples: np.ndarray,
+        first: int,
+    ) -> np.ndarray:
+        towards = np.empty_like(bundle)
+        rays.shadow_rays(
+            towards, bundle, t, triangle, self._normals, samples, self.seed, first, self._aperture
+        )
+        return self._occluded(towards)
+
+    @cached_property
+    def _ambient(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Face, light from elsewhere (both [H W]) and that light's mean by face [F]."""
+        _, triangle, points = self._pinhole
+        shape = triangle.shape
+        seen = triangle.ravel() >= 0
+        normals = self._normals[triangle.ravel()]
+        points = np.where(seen[:, None], points.reshape(-1, 3), 1e6)
+        facing = (normals * points).sum(1) > 0
+        normals = np.where(facing[:, None], -normals, normals)
+        samples = _points(max(self.paths // 4, 1), 6)
+        light = np.empty(seen.size)
+
+        def work(part: slice) -> None:
+            bundle = np.empty((part.stop - part.start, len(samples), 6), np.float32)
+            rays.hemisphere_rays(
+                bundle, points[part], normals[part], samples, self.seed, part.start
+            )
+            t, hit = self._cast(bundle)
+            shadowed = self._shadow(bundle, t, hit, samples, part.start)
+            rays.gather_ambient(
+                light[part],
+                bundle,
+                t,
+                hit,
+                shadowed,
+                self._normals,
+                self._albedo,
+                self._light,
+                self.lighting.sky,
+                self.lighting.bounce * pattern_mean(self._projector.pattern),
+            )
+
+        self._in_parts(seen.size, len(samples), work)
+        faces = np.where(seen, self._face[triangle.ravel()], -1).astype(np.int32)
+        counts = np.bincount(faces[seen], minlength=self._face_count)
+        sums = np.bincount(faces[seen], light[seen], minlength=self._face_count)
+        means = np.where(counts > 0, sums / np.maximum(counts, 1), self.lighting.sky / 2)
+        return faces.reshape(shape), light.reshape(shape), means
+
+    def _image(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
+        """A sensor's light with the pattern and with the projector open, each [H W]."""
+        rig = self.rig
+        size = rig.width_px * rig.height_px
+        faces, ambient, means = self._ambient
+        table, table_step = _pattern_table(self._projector.pattern, self._largest_blur())
+        pinhole = np.array([rig.focal_px("near"), *rig.centre_px])
+        camera = _camera(rig, channel)
+        striped, plain = np.empty(size), np.empty(size)
+
+        def work(part: slice) -> None:
+            bundle = np.empty((part.stop - part.start, self.paths, 6), np.float32)
+            weights = np.empty(bundle.shape[:2], np.float32)
+            rays.lens_rays(
+                bundle, weights, self._samples, self.seed, part.start, rig.width_px, camera
+            )
+            t, triangle = self._cast(bundle)
+            shadowed = self._shadow(bundle, t, triangle, self._samples, part.start)
+            rays.gather(
+                striped[part],
+                plain[part],
+                bundle,
+                weights,
+                t,
+                triangle,
+                shadowed,
+                self._normals,
+                self._albedo,
+                self._face,
+                self._light,
+                table,
+                table_step * self._projector.period_mm,
+                pinhole,
+                faces,
+                ambient,
+                means,
+            )
+
+        self._in_parts(size, self.paths, work)
+        falloff = _falloff(rig, channel)
+        shape = (rig.height_px, rig.width_px)
+        return striped.reshape(shape) * falloff, plain.reshape(shape) * falloff
+
+    def _largest_blur(self) -> float:
+        """Largest diameter of the projector's blur in the scene, in periods, rounded up."""
+        _, triangle, points = self._pinhole
+        seen = points[triangle >= 0]
+        if not seen.size:
+            return 1.0
+        blur = self._projector.blur_mm(seen) / self._projector.period_mm
+        return float(np.ceil(blur.max() * 1.2 + 0.1))
+
+
+def _camera(rig: Rig, channel: Channel) -> np.ndarray:
+    """What :func:`rays.lens_rays` wants to know of a sensor."""
+    x, y = rig.centre_px
+    affine = np.array([[1.0, 0, 0], [0, 1, 0]])
+    if channel == "far":
+        # The far image is the ideal one magnified, turned and shifted: undo that.
+        turn = np.deg2rad(rig.far_rotation_deg)
+        back = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        back /= rig.far_scale
+        middle = np.array([x, y])
+        shift = middle - back @ (middle + np.array(rig.far_shift_px))
+        affine = np.hstack([back, shift[:, None]])
+    return np.array(
+        [
+            x,
+            y,
+            rig.focal_px(channel),
+            *affine.ravel(),
+            rig.focus_mm(channel),
+            rig.aperture_mm / 2,
+            rig.vignette_distance_mm,
+            rig.vignette_radius_mm,
+        ]
+    )
+
+
+def _falloff(rig: Rig, channel: Channel) -> np.ndarray:
+    """cos⁴ of the angle to the axis, [H W]."""
+    x = (np.arange(rig.width_px) - rig.centre_px[0]) / rig.focal_px(channel)
+    y = (np.arange(rig.height_px) - rig.centre_px[1]) / rig.focal_px(channel)
+    return (1 + x[None, :] ** 2 + y[:, None] ** 2) ** -2
+
+
+@lru_cache(maxsize=8)
+def _points(count: int, dimensions: int) -> np.ndarray:
+    """``count`` points of the unit cube that fill it evenly (scrambled Sobol), [count dimensions].
+
+    Every pixel turns them by amounts of its own.
+    """
+    from scipy.stats import qmc
+
+    return qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(0)).random(count)
+
+
+@lru_cache(maxsize=8)
+def _pattern_table(pattern: Pattern, largest_blur: float) -> tuple[np.ndarray, float]:
+    """A period of the pattern under discs of growing diameter: [blur, along, across], and the step.
+
+    Diameters are in periods, from 0 to ``largest_blur``; entry (k, j, i) is the pattern at
+    (i / width, j / height).
+    """
+    height, width = _PATTERN_CELLS.get(pattern, (128, 128))
+    # Samples sit in the middle of what each stands for, an edge falling between two of them.
+    x = (np.arange(width) + 0.5)[None, :] / width
+    y = (np.arange(height) + 0.5)[:, None] / height
+    spectrum = np.fft.fft2(np.broadcast_to(pattern_value(pattern, x, y), (height, width)))
+    fx, fy = np.fft.fftfreq(width) * width, np.fft.fftfreq(height) * height
+    # Back from the middles to the grid's corners.
+    spectrum = spectrum * np.exp(-1j * np.pi * (fx[None, :] / width + fy[:, None] / height))
+    frequency = np.hypot(fx[None, :], fy[:, None])
+    diameters = np.linspace(0, largest_blur, _BLUR_LEVELS)
+    levels = [np.fft.ifft2(spectrum * disc_transfer(d * frequency)).real for d in diameters]
+    return np.stack(levels).astype(np.float32), float(diameters[1])
