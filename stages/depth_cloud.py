@@ -248,7 +248,13 @@ class DepthCloud(Stage):
         artifacts = logged.artifacts
         depth_m, confidence = artifacts["depth_m"], artifacts["confidence"]
         calibration = artifacts.get("calibration")
-        if calibration is not None:
+        if calibration is not None and calibration.texture is not None:
+            # The range may be wide: in 1/z, in which it is measured, it is seen evenly.
+            low, middle, high = (float(z) for z in calibration.z_m(np.array([0, 0.5, 1])))
+            ticks = (f"{1e3 * low:.0f} mm", f"{1e3 * middle:.0f} mm", f"{1e3 * high:.0f} mm")
+            relative = artifacts["depth_relative"]
+            show.log_map(recording, "depth_cloud/depth", relative, 0, 1, "turbo", ticks)
+        elif calibration is not None:
             low, high = calibration.near_z_m, calibration.far_z_m
             middle = (low + high) / 2
             ticks = (f"{1e3 * low:.0f} mm", f"{1e3 * middle:.0f} mm", f"{1e3 * high:.0f} mm")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from stages.dfd.calibration import Calibration
 from stages.dfd.focus import LaplacianKind, SensorNoise
 from stages.dfd.similarity import Similarity
 from stages.dfd.texture import texture_curve
-from stages.optics.rig import Rig
+from stages.optics.rig import CHANNELS, Rig
 from stages.optics.thin_lens import object_distance_mm
 from workbench.stage import StageParameters, knob
 
@@ -180,6 +179,12 @@ def from_optics(
     )
 
 
-def rig_of(source: Path | Mapping[str, str], size: tuple[int, int] | None) -> Rig:
-    """The rig of a TOML file, or of a recording's metadata.  Raises ``ValueError``."""
-    return read_rig(source, size) if isinstance(source, Path) else Rig.from_metadata(source)
+def rig_record(path: Path, size: tuple[int, int]) -> tuple[dict[str, str], dict[str, np.ndarray]]:
+    """A rig file as a recording holds it: the metadata record, and K [3 3] of each channel.
+
+    For images of ``size`` = (width, height).  Raises ``ValueError`` as :func:`read_rig`.
+    """
+    rig = read_rig(path, size)
+    cameras: dict[str, np.ndarray] = {one: rig.camera_matrix(one) for one in CHANNELS}
+    # The flat image is on the near one's grid.
+    return rig.to_metadata(), {**cameras, "flat": cameras["near"]}
