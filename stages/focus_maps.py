@@ -93,7 +93,7 @@ class FocusMaps(Stage):
         kind, subtract = parameters.laplacian, parameters.subtract_noise
         if texture is not None:
             focus_near, focus_far, known = texture_focus_maps(
-                near, far, texture, x_taps, y_taps, kind, subtract
+                near, far, texture, x_taps, y_taps, kind, subtract, striped=not alone
             )
         else:
             noise = known if subtract else None

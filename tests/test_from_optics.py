@@ -95,9 +95,10 @@ def test_bare_surfaces_have_no_depth(tmp_path: Path) -> None:
 def test_beyond_the_range_is_unknown_and_not_folded_back(tmp_path: Path) -> None:
     rig = read_rig(rig_file(tmp_path), WHOLE)
     made = from_optics(rig, WHOLE, OpticsParameters())
-    for z_mm in (730.0, 1450.0):
-        run = depth(made, tmp_path, *pair(rig, sharp("natural"), z_mm))
-        assert np.isfinite(run.artifacts["depth_m"]).mean() < 0.1
+    for kind in ("natural", "fine"):
+        for z_mm in (300.0, 500.0, 700.0, 1500.0, 5000.0):
+            run = depth(made, tmp_path, *pair(rig, sharp(kind), z_mm))
+            assert np.isfinite(run.artifacts["depth_m"][INNER]).mean() < 0.1
 
 
 def test_a_projected_pattern_is_used_where_the_rig_has_one(tmp_path: Path) -> None:
@@ -231,6 +232,13 @@ def test_a_rig_that_cannot_be_is_told_in_a_line(
         read_rig(rig_file(tmp_path, **changes), WHOLE)
     assert str(raised.value).startswith(str(tmp_path / "rig.toml"))
     assert "\n" not in str(raised.value)
+
+
+def test_the_sensors_width_stands_for_the_pitch(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, pixel_pitch_mm=None, sensor_width_mm=25.6)
+    assert read_rig(path, WHOLE).pixel_pitch_mm == pytest.approx(0.1)
+    with pytest.raises(ValueError, match="sensor_width_mm: expected the images' size"):
+        read_rig(path)
 
 
 def test_a_rig_without_a_unique_range_is_refused(tmp_path: Path) -> None:

@@ -24,16 +24,17 @@ from workbench.stage import StageParameters, knob
 SMALLEST_BLUR_PX = 0.7
 """Blur circle at the other focal plane under which there is no difference of sharpness to see."""
 
-_REQUIRED = ("focal_length_mm", "f_number", "pixel_pitch_mm")
+_REQUIRED = ("focal_length_mm", "f_number")
+_PITCH = ("pixel_pitch_mm", "sensor_width_mm")
 _NEAR = ("near_focus_mm", "near_sensor_mm")
 _FAR = ("far_focus_mm", "far_sensor_mm", "sensor_separation_mm")
 _INFINITY_MM = 1e7
 _FURTHEST_DIOPTRES = 0.02
 """The least 1/z of the working range, as a share of what lies between the focal planes."""
 _ASSUMED = (
-    "a thin lens with a round aperture, distances from its centre; textures whose spectrum is "
-    "measured in each window, of amplitudes like 1/frequency where a disc departs from a Gaussian; "
-    "grey levels linear in light; registration, balance of light and noise measured on each pair"
+    "a thin lens with a round aperture, distances from its centre; grey levels linear in light; "
+    "a texture's spectrum is measured in each window, and taken as 1/frequency where a disc "
+    "departs from a Gaussian; registration, balance of light and noise are measured on each pair"
 )
 
 
@@ -54,12 +55,13 @@ class OpticsParameters(StageParameters):
 def read_rig(path: Path, size: tuple[int, int] | None = None) -> Rig:
     """The rig in a TOML file, for pictures of ``size`` = (width, height).
 
-    The keys are those of :class:`stages.optics.Rig`, of which nothing optical may be left out
-    here: a default would be a guess about somebody's lens.  Besides ``far_focus_mm`` (inf is
-    allowed) and ``sensor_separation_mm``, the sensor's distances ``near_sensor_mm`` and
-    ``far_sensor_mm`` behind the lens may be given.  Without ``[projector]`` there is none, and
-    without ``registered`` near and far differ in magnification as the lens law says.  Raises
-    ``ValueError`` with one line.
+    The keys are those of :class:`stages.optics.rig.Rig`, of which nothing optical may be left out
+    here: a default would be a guess about somebody's lens.  The focal planes are given by
+    ``near_focus_mm`` and ``far_focus_mm`` (inf is allowed) or ``sensor_separation_mm``, or by the
+    sensor's distances behind the lens, ``near_sensor_mm`` and ``far_sensor_mm``; the pixels by
+    ``pixel_pitch_mm``, or by ``sensor_width_mm`` if the images show the whole sensor.  Without
+    ``[projector]`` there is none, and without ``registered`` near and far differ in magnification
+    as the lens law says.  Raises ``ValueError`` with one line.
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -68,10 +70,12 @@ def read_rig(path: Path, size: tuple[int, int] | None = None) -> Rig:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: expected TOML: {error}") from error
     missing = [key for key in _REQUIRED if key not in values]
-    missing += [" or ".join(keys) for keys in (_NEAR, _FAR) if not values.keys() & set(keys)]
+    missing += [
+        " or ".join(keys) for keys in (_PITCH, _NEAR, _FAR) if not values.keys() & set(keys)
+    ]
     if missing:
         raise ValueError(f"{path}: missing {', '.join(missing)}")
-    for keys in (_NEAR, _FAR):
+    for keys in (_PITCH, _NEAR, _FAR):
         both = [key for key in keys if key in values]
         if len(both) > 1:
             raise ValueError(f"{path}: expected one of {', '.join(both)}, found {len(both)}")
@@ -88,7 +92,18 @@ def read_rig(path: Path, size: tuple[int, int] | None = None) -> Rig:
                 f"the images are {width}×{height}"
             )
         values |= {"width_px": width, "height_px": height}
+    if "sensor_width_mm" in values:
+        sensor_mm, pixels = values.pop("sensor_width_mm"), values.get("width_px")
+        if pixels is None:
+            raise ValueError(f"{path}: sensor_width_mm: expected the images' size to go with it")
+        if not _is_number(sensor_mm) or not _is_number(pixels) or not pixels > 0:
+            raise ValueError(f"{path}: sensor_width_mm: expected a number, found {sensor_mm!r}")
+        values["pixel_pitch_mm"] = sensor_mm / pixels
     return Rig.from_values({"projector": None, "registered": False} | values, str(path))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _focus_distances(values: dict[str, Any]) -> dict[str, Any]:
@@ -97,8 +112,7 @@ def _focus_distances(values: dict[str, Any]) -> dict[str, Any]:
     for name in ("near", "far"):
         sensor = values.pop(f"{name}_sensor_mm", None)
         if sensor is not None:
-            numbers = (sensor, values["focal_length_mm"])
-            if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers):
+            if not (_is_number(sensor) and _is_number(values["focal_length_mm"])):
                 raise ValueError(f"{name}_sensor_mm: expected a number, found {sensor!r}")
             values[f"{name}_focus_mm"] = object_distance_mm(values["focal_length_mm"], sensor)
     if values.get("far_focus_mm") == math.inf:

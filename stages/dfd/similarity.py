@@ -302,16 +302,20 @@ def align_pair(near: np.ndarray, far: np.ndarray, starts: Sequence[Similarity]) 
             break
     if not pyramid:
         return starts[0]
-    found = []
-    for guess in starts:
-        current = guess
-        for pair in pyramid:
-            current = current.resized(pair[0].shape[1], pair[0].shape[0])
-            refined = refine_similarity([pair], current)
-            if _agreement(*pair, refined) > _agreement(*pair, current):
-                current = refined
-        found.append((_agreement(*pyramid[-1], current), current.resized(width, height)))
-    return max(found, key=lambda one: one[0])[1]
+
+    def refined(level: int, guess: Similarity) -> tuple[float, Similarity]:
+        """The guess made better on these images, or as it was, with the images' agreement."""
+        pair = pyramid[level]
+        known = guess.resized(pair[0].shape[1], pair[0].shape[0])
+        # From one level to the next there is little left to find.
+        better = refine_similarity([pair], known, iterations=3 if level else 12)
+        found = [(_agreement(*pair, one), one) for one in (known, better)]
+        return max(found, key=lambda one: one[0])
+
+    _, best = max((refined(0, guess) for guess in starts), key=lambda one: one[0])
+    for level in range(1, len(pyramid)):
+        _, best = refined(level, best)
+    return best.resized(width, height)
 
 
 def _agreement(near: np.ndarray, far: np.ndarray, similarity: Similarity) -> float:

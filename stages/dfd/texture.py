@@ -50,6 +50,13 @@ _MEAN_SQUARE_FREQUENCY = (0.02, 4.0)
 """Limits of the measured <ω²>, rad²/px²: what noise makes of an empty window lies outside."""
 _LEAST_TRANSFER = 1e-3
 _STRONGEST_LOG_RATIO = 4.0
+_ANTI_ALIAS = 0.5
+"""Standard deviation of the smoothing before an image is shrunk, in pixels of the small one."""
+_FOLD_SCALES = (2, 4)
+_FOLD_ENERGY = 4.0
+_FOLD_BEYOND = 1.1
+"""Of relative depth from its middle: what lies between the planes, and a little beyond, is within
+0.6."""
 _NOISE_LEVELS = 8
 _NOISE_FEWEST = 400
 _HIGH_PASS = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
@@ -172,6 +179,7 @@ def texture_focus_maps(
     y_taps: np.ndarray,
     kind: LaplacianKind,
     subtract_noise: bool,
+    striped: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, SensorNoise]:
     """Focus maps of ``near`` and ``far`` [H W] as the reference texture would show them.
 
@@ -182,12 +190,15 @@ def texture_focus_maps(
     """
     height, width = near.shape
     small = (max(1, width // texture.scale_px), max(1, height // texture.scale_px))
-    images = [_resized(image, small, cv2.INTER_AREA) for image in (near, far)]
+    # Averages over whole pixels leave the noise white, so that it can be told and subtracted.
+    images = _averaged(near, small), _averaged(far, small)
     noise = pair_noise(*images)
     (near_power, near_gradient), (far_power, far_gradient) = (
         _powers(image, x_taps, y_taps, kind, noise if subtract_noise else None) for image in images
     )
     known = (near_power > 0) & (far_power > 0)
+    if not striped:
+        known &= ~_folded(*images, texture, x_taps, y_taps, kind, noise)
     near_power, far_power = np.maximum(near_power, _TINY), np.maximum(far_power, _TINY)
     lowest, highest = _MEAN_SQUARE_FREQUENCY
     frequency = 0.5 * (
@@ -200,10 +211,56 @@ def texture_focus_maps(
     common = np.sqrt(np.sqrt(near_power) * np.sqrt(far_power)) * np.minimum(finer, 1)
     common *= known
     focus_near, focus_far = (
-        _resized(common * np.exp(sign * half_log_ratio), (width, height), cv2.INTER_LINEAR)
-        for sign in (1, -1)
+        _enlarged(common * np.exp(sign * half_log_ratio), (width, height)) for sign in (1, -1)
     )
     return focus_near, focus_far, noise
+
+
+def _folded(
+    near: np.ndarray,
+    far: np.ndarray,
+    texture: Texture,
+    x_taps: np.ndarray,
+    y_taps: np.ndarray,
+    kind: LaplacianKind,
+    noise: SensorNoise,
+) -> np.ndarray:
+    """Where surfaces lie far beyond the focal planes, bool [H W] of the images given.
+
+    Far beyond, both images are so blurred that nothing but the disc's side lobes is left in the
+    Laplacian's band, and the ratio says anything.  On images shrunk further the same blur is
+    small, the Gaussian law holds, and relative depth is told roughly, but not mistaken.
+    """
+    height, width = near.shape
+    folded = np.zeros((height, width), bool)
+    blur_px = texture.blur_px / texture.scale_px
+    lowest, highest = _MEAN_SQUARE_FREQUENCY
+    for factor in _FOLD_SCALES:
+        size = (width // factor, height // factor)
+        if min(size) < max(x_taps.size, y_taps.size):
+            break
+        quieter = SensorNoise(noise.read_variance / factor**2, noise.gain / factor**2)
+        powers = [
+            _powers(_shrunk(image, size), x_taps, y_taps, kind, quieter) for image in (near, far)
+        ]
+        (near_power, near_gradient), (far_power, far_gradient) = powers
+        # Without energy well above the noise a coarse scale knows nothing.
+        least = (
+            _FOLD_ENERGY
+            * float(_noise_gains(kind)[0])
+            * (quieter.read_variance + quieter.gain * float(near.mean()))
+        )
+        told = (near_power > least) & (far_power > least)
+        near_power, far_power = np.maximum(near_power, _TINY), np.maximum(far_power, _TINY)
+        frequency = 0.5 * (
+            np.clip(near_gradient / near_power, lowest, highest)
+            + np.clip(far_gradient / far_power, lowest, highest)
+        )
+        # A disc's variance is a sixteenth of its diameter squared; t - 1/2 by the Gaussian law.
+        off = 8 * (factor / blur_px) ** 2 * np.log(far_power / near_power) / frequency
+        beyond = (told & (np.abs(off) > _FOLD_BEYOND)).astype(np.uint8)
+        folded |= cv2.resize(beyond, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return folded
 
 
 def _powers(
@@ -269,7 +326,24 @@ def pair_noise(*images: np.ndarray) -> SensorNoise:
     return SensorNoise(max(float(fitted[0]), 1e-3), float(fitted[1]))
 
 
-def _resized(image: np.ndarray, size: tuple[int, int], how: int) -> np.ndarray:
+def _shrunk(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """``image`` averaged to ``size``, its finest detail taken off before.
+
+    What a box lets through beyond the new pixels' frequencies would come back as detail that only
+    the sharper image has.
+    """
+    factor = image.shape[1] / size[0]
+    return _averaged(cv2.GaussianBlur(image, (0, 0), _ANTI_ALIAS * factor), size)
+
+
+def _averaged(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    values = np.ascontiguousarray(image, np.float32)
+    if (image.shape[1], image.shape[0]) == size:
+        return values
+    return cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+
+
+def _enlarged(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if (image.shape[1], image.shape[0]) == size:
         return np.ascontiguousarray(image, np.float32)
-    return cv2.resize(image.astype(np.float32, copy=False), size, interpolation=how)
+    return cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
