@@ -54,9 +54,9 @@ _ANTI_ALIAS = 0.5
 """Standard deviation of the smoothing before an image is shrunk, in pixels of the small one."""
 _FOLD_SCALES = (2, 4)
 _FOLD_ENERGY = 4.0
-_FOLD_BEYOND = 1.1
-"""Of relative depth from its middle: what lies between the planes, and a little beyond, is within
-0.6."""
+_FOLD_BEYOND = 0.8
+"""Times the scale: relative depth from its middle that counts as far beyond.  Between the planes
+and a little outside it is within 0.6, and the coarser the scale, the more it errs."""
 _NOISE_LEVELS = 8
 _NOISE_FEWEST = 400
 _HIGH_PASS = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
@@ -258,7 +258,7 @@ def _folded(
         )
         # A disc's variance is a sixteenth of its diameter squared; t - 1/2 by the Gaussian law.
         off = 8 * (factor / blur_px) ** 2 * np.log(far_power / near_power) / frequency
-        beyond = (told & (np.abs(off) > _FOLD_BEYOND)).astype(np.uint8)
+        beyond = (told & (np.abs(off) > factor * _FOLD_BEYOND)).astype(np.uint8)
         folded |= cv2.resize(beyond, (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return folded
 
