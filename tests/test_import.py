@@ -261,6 +261,19 @@ def test_from_pictures_and_lens_data_to_depth(bench: Bench, tmp_path: Path) -> N
         )
 
 
+def test_a_striped_recording_is_measured_by_its_rig_alone(
+    bench: Bench, scene: Path, tmp_path: Path
+) -> None:
+    ended = bench("calibrate", scene, "--from-optics", scene, "-o", "c.npz")
+    assert ended.code == 0, ended.err
+    flags = ("--frames", "0:3", "--until", "depth_cloud", "--json")
+    ended = bench("evaluate", scene, "--calibration", "c.npz", *flags)
+    assert ended.code == 0, ended.err
+    scores = ended.json["presets"]["default"]["depth_cloud"]
+    (rms,) = [one["value"] for one in scores if one["name"] == "faces' interior rms"]
+    assert rms < 0.6
+
+
 def test_a_calibration_of_another_size_is_refused_and_one_of_any_is_not(
     bench: Bench, tmp_path: Path
 ) -> None:
