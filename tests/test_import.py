@@ -261,9 +261,7 @@ def test_from_pictures_and_lens_data_to_depth(bench: Bench, tmp_path: Path) -> N
         )
 
 
-def test_a_striped_recording_is_measured_by_its_rig_alone(
-    bench: Bench, scene: Path, tmp_path: Path
-) -> None:
+def test_a_striped_recording_is_measured_by_its_rig_alone(bench: Bench, scene: Path) -> None:
     ended = bench("calibrate", scene, "--from-optics", scene, "-o", "c.npz")
     assert ended.code == 0, ended.err
     flags = ("--frames", "0:3", "--until", "depth_cloud", "--json")
