@@ -19,7 +19,7 @@ _NUDGE_MM = 0.01
 
 
 @_compiled
-def _shift(seed, pixel, dimension):  # type: ignore[no-untyped-def]
+def _shift(seed, pixel, dimension):
     """A hash of three numbers as a float in [0, 1): how a pixel's samples are turned."""
     state = np.uint32(seed) * np.uint32(747796405) + np.uint32(2891336453)
     for value in (pixel, dimension):
@@ -33,7 +33,7 @@ def _shift(seed, pixel, dimension):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _on_disc(a, b):  # type: ignore[no-untyped-def]
+def _on_disc(a, b):
     """A point of the unit disc from a point of the unit square, area kept (Shirley and Chiu)."""
     x, y = 2 * a - 1, 2 * b - 1
     if x == 0 and y == 0:
@@ -46,7 +46,7 @@ def _on_disc(a, b):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def lens_rays(rays, weights, samples, seed, first, width, camera):  # type: ignore[no-untyped-def]
+def lens_rays(rays, weights, samples, seed, first, width, camera):
     """Rays from the lens through what pixels are focused on.
 
     ``rays`` [P S 6] float32 (origin, direction with z = 1, so that a ray's parameter is depth) and
@@ -78,12 +78,12 @@ def lens_rays(rays, weights, samples, seed, first, width, camera):  # type: igno
 
 
 @_compiled
-def _hit(ray, depth):  # type: ignore[no-untyped-def]
+def _hit(ray, depth):
     return ray[0] + depth * ray[3], ray[1] + depth * ray[4], ray[2] + depth * ray[5]
 
 
 @_compiled
-def _facing(normal, ray):  # type: ignore[no-untyped-def]
+def _facing(normal, ray):
     """The side of a surface that a ray sees."""
     nx, ny, nz = normal[0], normal[1], normal[2]
     if nx * ray[3] + ny * ray[4] + nz * ray[5] > 0:
@@ -92,7 +92,7 @@ def _facing(normal, ray):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def shadow_rays(out, rays, t, triangle, normals, samples, seed, first, projector):  # type: ignore[no-untyped-def]
+def shadow_rays(out, rays, t, triangle, normals, samples, seed, first, projector):
     """Rays from what was hit to points of the projector's aperture, their parameter 0 to 1.
 
     ``out`` is like ``rays`` [P S 6].  Surfaces turned away get a ray that leaves the scene; their
@@ -121,7 +121,7 @@ def shadow_rays(out, rays, t, triangle, normals, samples, seed, first, projector
 
 
 @_compiled
-def _irradiance(x, y, z, nx, ny, nz, light):  # type: ignore[no-untyped-def]
+def _irradiance(x, y, z, nx, ny, nz, light):
     """Open projector's light at a point: both cosines, inverse square; 0 where turned away.
 
     ``light`` is position (3), axis (3), focus distance, distance of the focal plane, across (3) and
@@ -137,7 +137,7 @@ def _irradiance(x, y, z, nx, ny, nz, light):  # type: ignore[no-untyped-def]
 
 
 @_compiled
-def _pattern(x, y, z, light, table, table_step):  # type: ignore[no-untyped-def]
+def _pattern(x, y, z, light, table, table_step):
     """Transmission of the pattern at a point, blurred by the projector's defocus there."""
     dx, dy, dz = x - light[0], y - light[1], z - light[2]
     forward = dx * light[3] + dy * light[4] + dz * light[5]
@@ -178,7 +178,7 @@ def gather(
     ambient_face,
     ambient,
     ambient_of_face,
-):  # type: ignore[no-untyped-def]
+):
     """Mean light of each pixel's rays: with the pattern, and with the projector open, [P].
 
     ``normals`` [T 3], ``albedo`` [T] and ``face`` [T] are by triangle; ``ambient`` [H W] is the
@@ -222,7 +222,7 @@ def gather(
 
 
 @_compiled
-def hemisphere_rays(out, points, normals, samples, seed, first):  # type: ignore[no-untyped-def]
+def hemisphere_rays(out, points, normals, samples, seed, first):
     """Cosine-weighted rays from ``points`` [P 3] about ``normals`` [P 3]: ``out`` [P S 6].
 
     Points that are not finite get rays that leave the scene.
@@ -246,7 +246,7 @@ def hemisphere_rays(out, points, normals, samples, seed, first):  # type: ignore
 
 
 @_compiled
-def gather_ambient(out, rays, t, triangle, shadowed, normals, albedo, light, sky, bounce):  # type: ignore[no-untyped-def]
+def gather_ambient(out, rays, t, triangle, shadowed, normals, albedo, light, sky, bounce):
     """Sky and one diffuse bounce of the projector's mean light, as seen along rays: ``out`` [P]."""
     for p in range(rays.shape[0]):
         total = 0.0

@@ -45,13 +45,14 @@ class Lighting:
 class Rendering:
     """Light and truth of one frame.
 
-    ``light`` maps near, far and flat (projector open, near focus) to float64 [H W]: albedo ×
-    irradiance, 1 for white facing the projector at its focus.  ``depth_mm`` is float64 [H W], z
-    along the axis through pixel centres, NaN where nothing is; ``instances`` and ``faces`` are
-    uint8 [H W].
+    ``light`` maps near and far to float64 [H W], albedo × irradiance: 1 for white facing the
+    projector at its focus; ``open_light`` is the same without the pattern, the projector open.
+    ``depth_mm`` is float64 [H W], z along the axis through pixel centres, NaN where nothing is;
+    ``instances`` and ``faces`` (coplanar groups, counted for each mesh from 0) are uint8 [H W].
     """
 
-    light: dict[str, np.ndarray]
+    light: dict[Channel, np.ndarray]
+    open_light: dict[Channel, np.ndarray]
     depth_mm: np.ndarray
     instances: np.ndarray
     faces: np.ndarray
@@ -89,6 +90,21 @@ def _require_in_front(rig: Rig, bodies: Sequence[Body]) -> None:
             )
 
 
+def visible_area_px(rig: Rig, bodies: Sequence[Body], instance: int, per_px: int = 3) -> float:
+    """How many pixels show an instance, as a pinhole sees it through ``per_px``² points of each."""
+    with ThreadPoolExecutor(1) as pool:
+        fine = rig.model_copy(
+            update={
+                "width_px": rig.width_px * per_px,
+                "height_px": rig.height_px * per_px,
+                "pixel_pitch_mm": rig.pixel_pitch_mm / per_px,
+                "principal_point_px": None,
+            }
+        )
+        seen = _Tracer(fine, bodies, Lighting(), 1, 0, pool).instances()
+    return float((seen == instance).sum()) / per_px**2
+
+
 class _Tracer:
     """One frame's scene, ready to be hit by rays."""
 
@@ -112,8 +128,8 @@ class _Tracer:
         count = 0
         for body in bodies:
             self._scene.add_triangles(
-                self._tensor(body.vertices_mm.astype(np.float32)),
-                self._tensor(body.mesh.triangles.astype(np.uint32)),
+                self._tensor.from_numpy(body.vertices_mm.astype(np.float32)),
+                self._tensor.from_numpy(body.mesh.triangles.astype(np.uint32)),
             )
             firsts.append(count)
             count += len(body.mesh.triangles)
@@ -175,20 +191,23 @@ class _Tracer:
         depth, triangle = self._cast(bundle)
         return depth.astype(float), triangle, directions * depth[..., None]
 
+    def instances(self) -> np.ndarray:
+        """The instance that each pixel's centre sees, 0 for none, uint8 [H W]."""
+        _, triangle, _ = self._pinhole
+        return np.where(triangle >= 0, self._instance[triangle], 0).astype(np.uint8)
+
     def rendering(self) -> Rendering:
         depth, triangle, _ = self._pinhole
         seen = triangle >= 0
-        light = {}
+        light, open_light = {}, {}
         for channel in CHANNELS:
-            striped, plain = self._image(channel)
-            light[channel] = striped
-            if channel == "near":
-                light["flat"] = plain
+            light[channel], open_light[channel] = self._image(channel)
         groups = np.minimum(self._group, 255)
         return Rendering(
             light,
+            open_light,
             np.where(seen, depth, np.nan),
-            np.where(seen, self._instance[triangle], 0).astype(np.uint8),
+            self.instances(),
             np.where(seen, groups[triangle], 0).astype(np.uint8),
         )
 
