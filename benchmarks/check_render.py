@@ -52,7 +52,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--frames", type=int, default=None)
-    parser.add_argument("--paths", type=int, default=128)
+    parser.add_argument("--paths", type=int, default=64)
     parser.add_argument("--pictures", type=Path)
     arguments = parser.parse_args()
     recording = Recording.open(arguments.recording)
@@ -72,9 +72,10 @@ def main() -> None:
             if channel not in frame.images:
                 rms.append(np.nan)
                 continue
-            light = made.light[channel] * EXPOSURE * (0.9 if channel == "flat" else 1.0)
-            if pattern_off and channel != "flat":
-                light = made.light["flat"] * EXPOSURE
+            if channel == "flat":
+                light = 0.9 * EXPOSURE * made.open_light["near"]
+            else:
+                light = EXPOSURE * (made.open_light if pattern_off else made.light)[channel]
             error = np.clip(light, 0, 1) - frame.images[channel] / 255
             rms.append(100 * float(np.sqrt((error**2).mean())))
             if arguments.pictures:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stages.optics.rig import CHANNELS, Channel
-from stages.simulation.render import render
+from stages.simulation.render import Rendering, render
 from stages.simulation.scene import FrameSpec, Scene
 from stages.simulation.sensor import WHITE_ALBEDO
 from workbench.procedures import SimulatedFrame
@@ -57,14 +57,23 @@ class Procedure:
 
     def frames(self, start: int, stop: int) -> Iterator[SimulatedFrame]:
         """Render frames ``start`` to ``stop``.  Raises DataError where one cannot be."""
+        scenes = self._scene.scene_indices
+        scene, spec, made = -1, None, None
         for index in range(start, stop):
-            yield self._frame(index, self._scene.makers[index]([self._seed, index]))
+            if scenes[index] != scene or spec is None or made is None:
+                scene = scenes[index]
+                spec = self._scene.makers[index]([self._seed, scene])
+                made = render(
+                    self._scene.rig,
+                    spec.bodies,
+                    self._scene.lighting,
+                    self._scene.values.paths,
+                    _hash(self._seed, scene),
+                )
+            yield self._frame(index, scene, spec, made)
 
-    def _frame(self, index: int, spec: FrameSpec) -> SimulatedFrame:
-        values, rig = self._scene.values, self._scene.rig
-        made = render(
-            rig, spec.bodies, self._scene.lighting, values.paths, _hash(self._seed, index)
-        )
+    def _frame(self, index: int, scene: int, spec: FrameSpec, made: Rendering) -> SimulatedFrame:
+        values = self._scene.values
         level = values.exposure.level / WHITE_ALBEDO
         images = {}
         sources: list[tuple[str, Channel, bool, float]]
@@ -81,7 +90,7 @@ class Procedure:
         objects = [body for body in spec.bodies if body.instance and body.name != "marks"]
         meta = spec.meta | {
             "frame": index,
-            "scene_index": index,
+            "scene_index": scene,
             "seed": self._seed,
             "objects": [
                 {"id": body.instance, "name": body.name, "albedo": body.albedo} for body in objects
@@ -102,5 +111,5 @@ class Procedure:
 
 
 def _hash(seed: int, index: int) -> int:
-    """One 32-bit number of a seed and a frame's index."""
+    """One 32-bit number of a seed and a scene's index."""
     return int(np.random.SeedSequence([seed, index]).generate_state(1)[0])

@@ -46,34 +46,65 @@ def _on_disc(a, b):
 
 
 @_compiled
-def lens_rays(rays, weights, samples, seed, first, width, camera):
+def _ideal(x, y, camera):
+    """The direction (z = 1) that a pixel position sees through the lens's centre."""
+    qx = camera[3] * x + camera[4] * y + camera[5]
+    qy = camera[6] * x + camera[7] * y + camera[8]
+    return (qx - camera[0]) / camera[2], (qy - camera[1]) / camera[2]
+
+
+@_compiled
+def _lens_ray(x, y, sample, turns, camera):
+    """Origin's x and y, direction's x and y (z = 1), and whether the stop lets it pass."""
+    dx, dy = _ideal(
+        x - 0.5 + (sample[0] + turns[0]) % 1, y - 0.5 + (sample[1] + turns[1]) % 1, camera
+    )
+    u, v = _on_disc((sample[2] + turns[2]) % 1, (sample[3] + turns[3]) % 1)
+    ox, oy = u * camera[10], v * camera[10]
+    dx, dy = dx - ox / camera[9], dy - oy / camera[9]
+    passes = camera[12] <= 0 or (
+        math.hypot(ox + dx * camera[11], oy + dy * camera[11]) < camera[12]
+    )
+    return ox, oy, dx, dy, passes
+
+
+@_compiled
+def _turns(seed, pixel):
+    return (
+        _shift(seed, pixel, 0),
+        _shift(seed, pixel, 1),
+        _shift(seed, pixel, 2),
+        _shift(seed, pixel, 3),
+    )
+
+
+@_compiled
+def pinhole_rays(rays, width, pad, camera):
+    """Rays from the lens's centre through pixel centres, ``pad`` more at each side: [P 6]."""
+    for p in range(rays.shape[0]):
+        x, y = p % (width + 2 * pad) - pad, p // (width + 2 * pad) - pad
+        dx, dy = _ideal(x, y, camera)
+        rays[p, 0] = rays[p, 1] = rays[p, 2] = 0
+        rays[p, 3], rays[p, 4], rays[p, 5] = dx, dy, 1.0
+
+
+@_compiled
+def lens_rays(rays, weights, samples, seed, pixels, width, camera):
     """Rays from the lens through what pixels are focused on.
 
     ``rays`` [P S 6] float32 (origin, direction with z = 1, so that a ray's parameter is depth) and
-    ``weights`` [P S] (0 where the stop cuts a ray) are filled for the pixels from ``first`` on.
+    ``weights`` [P S] (0 where the stop cuts a ray) are filled for ``pixels`` [P], counted by rows.
     ``samples`` [S 6] are points of the unit cube: pixel, lens, projector.  ``camera`` is centre x
     and y, focal length, a 2 3 matrix from the pixel to the ideal one, focus, aperture's radius,
     stop's distance and radius.
     """
     for p in range(rays.shape[0]):
-        pixel = first + p
-        x, y = pixel % width, pixel // width
-        s0, s1 = _shift(seed, pixel, 0), _shift(seed, pixel, 1)
-        s2, s3 = _shift(seed, pixel, 2), _shift(seed, pixel, 3)
+        x, y = pixels[p] % width, pixels[p] // width
+        turns = _turns(seed, pixels[p])
         for s in range(samples.shape[0]):
-            px = x - 0.5 + (samples[s, 0] + s0) % 1
-            py = y - 0.5 + (samples[s, 1] + s1) % 1
-            qx = camera[3] * px + camera[4] * py + camera[5]
-            qy = camera[6] * px + camera[7] * py + camera[8]
-            u, v = _on_disc((samples[s, 2] + s2) % 1, (samples[s, 3] + s3) % 1)
-            ox, oy = u * camera[10], v * camera[10]
-            dx = (qx - camera[0]) / camera[2] - ox / camera[9]
-            dy = (qy - camera[1]) / camera[2] - oy / camera[9]
+            ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], turns, camera)
             rays[p, s, 0], rays[p, s, 1], rays[p, s, 2] = ox, oy, 0.0
             rays[p, s, 3], rays[p, s, 4], rays[p, s, 5] = dx, dy, 1.0
-            passes = True
-            if camera[12] > 0:
-                passes = math.hypot(ox + dx * camera[11], oy + dy * camera[11]) < camera[12]
             weights[p, s] = 1.0 if passes else 0.0
 
 
@@ -92,14 +123,14 @@ def _facing(normal, ray):
 
 
 @_compiled
-def shadow_rays(out, rays, t, triangle, normals, samples, seed, first, projector):
+def shadow_rays(out, rays, t, triangle, normals, samples, seed, pixels, projector):
     """Rays from what was hit to points of the projector's aperture, their parameter 0 to 1.
 
     ``out`` is like ``rays`` [P S 6].  Surfaces turned away get a ray that leaves the scene; their
     irradiance is 0 in any case.  ``projector`` is its position, x and y axis, aperture's radius.
     """
     for p in range(rays.shape[0]):
-        s4, s5 = _shift(seed, first + p, 4), _shift(seed, first + p, 5)
+        s4, s5 = _shift(seed, pixels[p], 4), _shift(seed, pixels[p], 5)
         for s in range(rays.shape[1]):
             out[p, s, :] = 0
             out[p, s, 2] = -1e6
@@ -160,9 +191,27 @@ def _pattern(x, y, z, light, table, table_step):
 
 
 @_compiled
+def _from_elsewhere(x, y, z, own, pinhole, ambient_face, ambient, ambient_of_face):
+    """Sky and bounce at a point: they change slowly, so a near pixel's of the same face do."""
+    height, width = ambient.shape
+    i = int(round(pinhole[0] * x / z + pinhole[1]))
+    j = int(round(pinhole[0] * y / z + pinhole[2]))
+    i = min(max(i, 0), width - 1)
+    j = min(max(j, 0), height - 1)
+    if ambient_face[j, i] == own:
+        return ambient[j, i]
+    value, nearest = ambient_of_face[own], 1000
+    for jj in range(max(j - 2, 0), min(j + 3, height)):
+        for ii in range(max(i - 2, 0), min(i + 3, width)):
+            apart = (ii - i) ** 2 + (jj - j) ** 2
+            if ambient_face[jj, ii] == own and apart < nearest:
+                nearest, value = apart, ambient[jj, ii]
+    return value
+
+
+@_compiled
 def gather(
-    striped,
-    plain,
+    out,
     rays,
     weights,
     t,
@@ -179,13 +228,12 @@ def gather(
     ambient,
     ambient_of_face,
 ):
-    """Mean light of each pixel's rays: with the pattern, and with the projector open, [P].
+    """Mean light of each pixel's rays, with the pattern and with the projector open: [2 P].
 
     ``normals`` [T 3], ``albedo`` [T] and ``face`` [T] are by triangle; ``ambient`` [H W] is the
     light from elsewhere by pixel of the ``pinhole`` (focal length, centre x, y) that sees
     ``ambient_face`` [H W], and ``ambient_of_face`` [F] stands in where it does not see a face.
     """
-    height, width = ambient.shape
     for p in range(rays.shape[0]):
         with_pattern, without = 0.0, 0.0
         for s in range(rays.shape[1]):
@@ -194,22 +242,9 @@ def gather(
                 continue
             x, y, z = _hit(rays[p, s], t[p, s])
             nx, ny, nz = _facing(normals[k], rays[p, s])
-            # Light from elsewhere changes slowly: what a nearby pixel of the same face gets.
-            i = int(round(pinhole[0] * x / z + pinhole[1]))
-            j = int(round(pinhole[0] * y / z + pinhole[2]))
-            i = min(max(i, 0), width - 1)
-            j = min(max(j, 0), height - 1)
-            other = ambient_of_face[face[k]]
-            if ambient_face[j, i] == face[k]:
-                other = ambient[j, i]
-            else:
-                nearest = 1000
-                for jj in range(max(j - 2, 0), min(j + 3, height)):
-                    for ii in range(max(i - 2, 0), min(i + 3, width)):
-                        apart = (ii - i) ** 2 + (jj - j) ** 2
-                        if ambient_face[jj, ii] == face[k] and apart < nearest:
-                            nearest = apart
-                            other = ambient[jj, ii]
+            other = _from_elsewhere(
+                x, y, z, face[k], pinhole, ambient_face, ambient, ambient_of_face
+            )
             direct, patterned = 0.0, 0.0
             if not shadowed[p, s]:
                 direct = _irradiance(x, y, z, nx, ny, nz, light)
@@ -217,18 +252,74 @@ def gather(
                     patterned = direct * _pattern(x, y, z, light, table, table_step)
             with_pattern += albedo[k] * (patterned + other)
             without += albedo[k] * (direct + other)
-        striped[p] = with_pattern / rays.shape[1]
-        plain[p] = without / rays.shape[1]
+        out[0, p] = with_pattern / rays.shape[1]
+        out[1, p] = without / rays.shape[1]
 
 
 @_compiled
-def hemisphere_rays(out, points, normals, samples, seed, first):
+def gather_plain(
+    out,
+    samples,
+    seed,
+    pixels,
+    width,
+    camera,
+    triangle,
+    shadowed,
+    corners,
+    normals,
+    albedo,
+    face,
+    light,
+    table,
+    table_step,
+    pinhole,
+    ambient_face,
+    ambient,
+    ambient_of_face,
+):
+    """What :func:`gather` gives for pixels whose rays all end on one plane, lit or shadowed alike.
+
+    ``triangle`` [P] is what each sees and ``corners`` [T 3] a point of each triangle.  The plane is
+    met without tracing, and its irradiance is that of the pixel's centre.
+    """
+    for p in range(pixels.shape[0]):
+        x, y = pixels[p] % width, pixels[p] // width
+        k = triangle[p]
+        nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+        offset = nx * corners[k, 0] + ny * corners[k, 1] + nz * corners[k, 2]
+        dx, dy = _ideal(x, y, camera)
+        z = offset / (nx * dx + ny * dy + nz)
+        other = _from_elsewhere(
+            z * dx, z * dy, z, face[k], pinhole, ambient_face, ambient, ambient_of_face
+        )
+        side = -1.0 if offset > 0 else 1.0
+        direct = 0.0
+        if not shadowed[p]:
+            direct = _irradiance(z * dx, z * dy, z, side * nx, side * ny, side * nz, light)
+        turns = _turns(seed, pixels[p])
+        passed, transmitted = 0.0, 0.0
+        if direct > 0 or camera[12] > 0:
+            for s in range(samples.shape[0]):
+                ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], turns, camera)
+                if passes:
+                    passed += 1
+                    z = (offset - nx * ox - ny * oy) / (nx * dx + ny * dy + nz)
+                    transmitted += _pattern(ox + z * dx, oy + z * dy, z, light, table, table_step)
+        else:
+            passed = samples.shape[0]
+        out[0, p] = albedo[k] * (direct * transmitted + other * passed) / samples.shape[0]
+        out[1, p] = albedo[k] * (direct + other) * passed / samples.shape[0]
+
+
+@_compiled
+def hemisphere_rays(out, points, normals, samples, seed, pixels):
     """Cosine-weighted rays from ``points`` [P 3] about ``normals`` [P 3]: ``out`` [P S 6].
 
     Points that are not finite get rays that leave the scene.
     """
     for p in range(points.shape[0]):
-        s0, s1 = _shift(seed, first + p, 6), _shift(seed, first + p, 7)
+        s0, s1 = _shift(seed, pixels[p], 6), _shift(seed, pixels[p], 7)
         nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
         # Any two directions in the surface (Duff and others, 2017).
         sign = 1.0 if nz >= 0 else -1.0

@@ -10,6 +10,7 @@ A part's frame has its origin at the part's centroid; at angle 0 it lies as its 
 
 from __future__ import annotations
 
+import itertools
 import math
 import tomllib
 from abc import ABC, abstractmethod
@@ -77,7 +78,10 @@ class FrameSpec:
 
 
 Maker = Callable[[Sequence[int]], FrameSpec]
-"""Makes a frame from a seed; what needs none has been made, and checked, before."""
+"""Makes a frame from a seed; what needs none has been made, and checked, before.
+
+One maker several times over makes exposures of one scene, which differ in the sensor's noise only.
+"""
 
 
 class Table(pydantic.BaseModel):
@@ -156,8 +160,8 @@ class Planes(_Series):
                 if tilt:
                     meta |= {"tilt": tilt, "tilt_direction": direction}
                 spec = FrameSpec([Body("plane", square(), pose, self.albedo, 1)], meta)
-                for _ in range(self.shots):
-                    yield _ready(spec)
+                one = _ready(spec)
+                yield from [one] * self.shots
 
 
 class Grid(_Series):
@@ -362,7 +366,7 @@ class SceneFile(pydantic.BaseModel):
     """Light of the open sky, as a fraction of the projector's at its focus."""
     bounce: pydantic.NonNegativeFloat = 1.0
     """Strength of the one diffuse bounce between surfaces; 1 is physical."""
-    paths: pydantic.PositiveInt = 128
+    paths: pydantic.PositiveInt = 64
     """Rays for each pixel and image, a power of two; more is less noise and more time."""
     flat: bool = True
     """Whether the flat image, pattern off, is recorded too."""
@@ -390,6 +394,12 @@ class Scene:
     values: SceneFile
     rig: Rig
     makers: list[Maker] = field(repr=False)
+
+    @property
+    def scene_indices(self) -> list[int]:
+        """Which scene each frame is an exposure of."""
+        changes = [one is not other for one, other in itertools.pairwise(self.makers)]
+        return list(itertools.accumulate(changes, initial=0))
 
     @property
     def lighting(self) -> Lighting:
