@@ -20,7 +20,7 @@ _NUDGE_MM = 0.01
 
 @_compiled
 def _shift(seed, pixel, dimension):
-    """A hash of three numbers as a float in [0, 1): how a pixel's samples are turned."""
+    """A hash of three numbers, uint32: how a pixel's samples are moved."""
     state = np.uint32(seed) * np.uint32(747796405) + np.uint32(2891336453)
     for value in (pixel, dimension):
         state = (state ^ np.uint32(value)) * np.uint32(2654435769)
@@ -29,7 +29,13 @@ def _shift(seed, pixel, dimension):
         state ^= state >> np.uint32(13)
         state *= np.uint32(3266489917)
         state ^= state >> np.uint32(16)
-    return state * 2.3283064365386963e-10
+    return np.uint32(state)
+
+
+@_compiled
+def _unit(sample, shift):
+    """A sample (uint32) moved by a digital shift, which keeps a net a net, in [0, 1)."""
+    return np.uint32(sample ^ shift) * 2.3283064365386963e-10
 
 
 @_compiled
@@ -54,12 +60,12 @@ def _ideal(x, y, camera):
 
 
 @_compiled
-def _lens_ray(x, y, sample, turns, camera):
+def _lens_ray(x, y, sample, moves, camera):
     """Origin's x and y, direction's x and y (z = 1), and whether the stop lets it pass."""
     dx, dy = _ideal(
-        x - 0.5 + (sample[0] + turns[0]) % 1, y - 0.5 + (sample[1] + turns[1]) % 1, camera
+        x - 0.5 + _unit(sample[0], moves[0]), y - 0.5 + _unit(sample[1], moves[1]), camera
     )
-    u, v = _on_disc((sample[2] + turns[2]) % 1, (sample[3] + turns[3]) % 1)
+    u, v = _on_disc(_unit(sample[2], moves[2]), _unit(sample[3], moves[3]))
     ox, oy = u * camera[10], v * camera[10]
     dx, dy = dx - ox / camera[9], dy - oy / camera[9]
     passes = camera[12] <= 0 or (
@@ -69,7 +75,7 @@ def _lens_ray(x, y, sample, turns, camera):
 
 
 @_compiled
-def _turns(seed, pixel):
+def _moves(seed, pixel):
     return (
         _shift(seed, pixel, 0),
         _shift(seed, pixel, 1),
@@ -94,15 +100,15 @@ def lens_rays(rays, weights, samples, seed, pixels, width, camera):
 
     ``rays`` [P S 6] float32 (origin, direction with z = 1, so that a ray's parameter is depth) and
     ``weights`` [P S] (0 where the stop cuts a ray) are filled for ``pixels`` [P], counted by rows.
-    ``samples`` [S 6] are points of the unit cube: pixel, lens, projector.  ``camera`` is centre x
+    ``samples`` [S 6] uint32 are points of a cube: pixel, lens, projector.  ``camera`` is centre x
     and y, focal length, a 2 3 matrix from the pixel to the ideal one, focus, aperture's radius,
     stop's distance and radius.
     """
     for p in range(rays.shape[0]):
         x, y = pixels[p] % width, pixels[p] // width
-        turns = _turns(seed, pixels[p])
+        moves = _moves(seed, pixels[p])
         for s in range(samples.shape[0]):
-            ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], turns, camera)
+            ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], moves, camera)
             rays[p, s, 0], rays[p, s, 1], rays[p, s, 2] = ox, oy, 0.0
             rays[p, s, 3], rays[p, s, 4], rays[p, s, 5] = dx, dy, 1.0
             weights[p, s] = 1.0 if passes else 0.0
@@ -137,7 +143,7 @@ def shadow_rays(out, rays, t, triangle, normals, samples, seed, pixels, projecto
             out[p, s, 5] = -1.0
             if triangle[p, s] < 0:
                 continue
-            u, v = _on_disc((samples[s, 4] + s4) % 1, (samples[s, 5] + s5) % 1)
+            u, v = _on_disc(_unit(samples[s, 4], s4), _unit(samples[s, 5], s5))
             u, v = u * projector[9], v * projector[9]
             x, y, z = _hit(rays[p, s], t[p, s])
             nx, ny, nz = _facing(normals[triangle[p, s]], rays[p, s])
@@ -168,13 +174,19 @@ def _irradiance(x, y, z, nx, ny, nz, light):
 
 
 @_compiled
-def _pattern(x, y, z, light, table, table_step):
-    """Transmission of the pattern at a point, blurred by the projector's defocus there."""
+def _cycles(x, y, z, light):
+    """Where the light at a point crosses the projector's focal plane, and 1 - blur / aperture."""
     dx, dy, dz = x - light[0], y - light[1], z - light[2]
-    forward = dx * light[3] + dy * light[4] + dz * light[5]
-    scale = light[7] / forward
+    scale = light[7] / (dx * light[3] + dy * light[4] + dz * light[5])
     u = (dx * light[8] + dy * light[9] + dz * light[10]) * scale
     v = (dx * light[11] + dy * light[12] + dz * light[13]) * scale
+    return u, v, scale
+
+
+@_compiled
+def _pattern(x, y, z, light, table, table_step):
+    """Transmission of the pattern at a point, blurred by the projector's defocus there."""
+    u, v, scale = _cycles(x, y, z, light)
     levels, height, width = table.shape
     at = min(light[14] * abs(1 - scale) / table_step, levels - 1.001)
     a = (u - math.floor(u)) * width
@@ -257,6 +269,31 @@ def gather(
 
 
 @_compiled
+def _transfer(cycles, table, step):
+    """Transfer of a uniform disc, from a table over diameter × frequency."""
+    at = abs(cycles) / step
+    k = int(at)
+    if k + 1 >= table.shape[0]:
+        return 0.0
+    return table[k] + (at - k) * (table[k + 1] - table[k])
+
+
+@_compiled
+def _sinc(value):
+    argument = math.pi * value
+    return 1.0 if abs(argument) < 1e-6 else math.sin(argument) / argument
+
+
+@_compiled
+def _plane_cycles(x, y, ox, oy, normal, offset, camera, light):
+    """Where in the pattern the ray of a pixel position and a lens point ends on a plane."""
+    dx, dy = _ideal(x, y, camera)
+    dx, dy = dx - ox / camera[9], dy - oy / camera[9]
+    z = (offset - normal[0] * ox - normal[1] * oy) / (normal[0] * dx + normal[1] * dy + normal[2])
+    return _cycles(ox + z * dx, oy + z * dy, z, light)[0]
+
+
+@_compiled
 def gather_plain(
     out,
     samples,
@@ -267,6 +304,9 @@ def gather_plain(
     triangle,
     shadowed,
     corners,
+    waves,
+    disc,
+    disc_step,
     normals,
     albedo,
     face,
@@ -281,12 +321,16 @@ def gather_plain(
     """What :func:`gather` gives for pixels whose rays all end on one plane, lit or shadowed alike.
 
     ``triangle`` [P] is what each sees and ``corners`` [T 3] a point of each triangle.  The plane is
-    met without tracing, and its irradiance is that of the pixel's centre.
+    met without tracing, and its irradiance is that of the pixel's centre.  Stripes, given as
+    ``waves`` [N 2] (mean; harmonic and amplitude of each sine), are blurred in closed form: the
+    lens, the projector's aperture and the pixel each multiply a wave by their transfer.  Other
+    patterns, and bundles that the stop cuts, are sampled.
     """
     for p in range(pixels.shape[0]):
         x, y = pixels[p] % width, pixels[p] // width
         k = triangle[p]
-        nx, ny, nz = normals[k, 0], normals[k, 1], normals[k, 2]
+        normal = normals[k]
+        nx, ny, nz = normal[0], normal[1], normal[2]
         offset = nx * corners[k, 0] + ny * corners[k, 1] + nz * corners[k, 2]
         dx, dy = _ideal(x, y, camera)
         z = offset / (nx * dx + ny * dy + nz)
@@ -297,19 +341,55 @@ def gather_plain(
         direct = 0.0
         if not shadowed[p]:
             direct = _irradiance(z * dx, z * dy, z, side * nx, side * ny, side * nz, light)
-        turns = _turns(seed, pixels[p])
-        passed, transmitted = 0.0, 0.0
-        if direct > 0 or camera[12] > 0:
+        whole = camera[12] <= 0 or (
+            math.hypot(dx, dy) * camera[11] + camera[10] * abs(1 - camera[11] / camera[9])
+            < camera[12]
+        )
+        passed, transmitted = 1.0, 0.0
+        if whole and direct == 0:
+            pass
+        elif whole and waves.shape[0] > 0:
+            u, _, scale = _cycles(z * dx, z * dy, z, light)
+            radius = camera[10]
+            right = _plane_cycles(x + 0.5, y, 0.0, 0.0, normal, offset, camera, light)
+            left = _plane_cycles(x - 0.5, y, 0.0, 0.0, normal, offset, camera, light)
+            down = _plane_cycles(x, y + 0.5, 0.0, 0.0, normal, offset, camera, light)
+            up = _plane_cycles(x, y - 0.5, 0.0, 0.0, normal, offset, camera, light)
+            east = _plane_cycles(x, y, radius, 0.0, normal, offset, camera, light)
+            west = _plane_cycles(x, y, -radius, 0.0, normal, offset, camera, light)
+            south = _plane_cycles(x, y, 0.0, radius, normal, offset, camera, light)
+            north = _plane_cycles(x, y, 0.0, -radius, normal, offset, camera, light)
+            lens = math.hypot(east - west, south - north)
+            spread = (
+                light[14] * abs(1 - scale) * math.hypot(math.hypot(light[8], light[9]), light[10])
+            )
+            transmitted = waves[0, 1]
+            for w in range(1, waves.shape[0]):
+                m = waves[w, 0]
+                transmitted += (
+                    waves[w, 1]
+                    * _transfer(m * lens, disc, disc_step)
+                    * _transfer(m * spread, disc, disc_step)
+                    * _sinc(m * (right - left))
+                    * _sinc(m * (down - up))
+                    * math.sin(2 * math.pi * m * u)
+                )
+        else:
+            moves = _moves(seed, pixels[p])
+            passed = 0.0
             for s in range(samples.shape[0]):
-                ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], turns, camera)
+                ox, oy, dx, dy, passes = _lens_ray(x, y, samples[s], moves, camera)
                 if passes:
                     passed += 1
-                    z = (offset - nx * ox - ny * oy) / (nx * dx + ny * dy + nz)
-                    transmitted += _pattern(ox + z * dx, oy + z * dy, z, light, table, table_step)
-        else:
-            passed = samples.shape[0]
-        out[0, p] = albedo[k] * (direct * transmitted + other * passed) / samples.shape[0]
-        out[1, p] = albedo[k] * (direct + other) * passed / samples.shape[0]
+                    if direct > 0:
+                        z = (offset - nx * ox - ny * oy) / (nx * dx + ny * dy + nz)
+                        transmitted += _pattern(
+                            ox + z * dx, oy + z * dy, z, light, table, table_step
+                        )
+            passed /= samples.shape[0]
+            transmitted /= samples.shape[0]
+        out[0, p] = albedo[k] * (direct * transmitted + other * passed)
+        out[1, p] = albedo[k] * (direct + other) * passed
 
 
 @_compiled
@@ -326,7 +406,7 @@ def hemisphere_rays(out, points, normals, samples, seed, pixels):
         a = -1 / (sign + nz)
         b = nx * ny * a
         for s in range(samples.shape[0]):
-            u, v = _on_disc((samples[s, 0] + s0) % 1, (samples[s, 1] + s1) % 1)
+            u, v = _on_disc(_unit(samples[s, 0], s0), _unit(samples[s, 1], s1))
             w = math.sqrt(max(0.0, 1 - u * u - v * v))
             out[p, s, 0] = points[p, 0] + _NUDGE_MM * nx
             out[p, s, 1] = points[p, 1] + _NUDGE_MM * ny

@@ -403,6 +403,8 @@ class _Tracer:
                 seen[pixels],
                 dark[pixels],
                 self._corners,
+                _stripe_waves(self._projector.pattern, rig.period_px(channel)),
+                *_disc_table(),
                 *shading,
             )
             striped[pixels], plain[pixels] = result
@@ -421,6 +423,29 @@ class _Tracer:
             return 1.0
         blur = self._projector.blur_mm(seen) / self._projector.period_mm
         return float(np.ceil(blur.max() * 1.2 + 0.1))
+
+
+@lru_cache(maxsize=8)
+def _stripe_waves(pattern: Pattern, period_px: float) -> np.ndarray:
+    """What makes up a pattern of stripes: mean, then harmonic and amplitude of sines, [N 2].
+
+    As many as a pixel does not average out; empty for patterns in two directions.
+    """
+    if pattern == "none":
+        return np.array([[0.0, 1.0]])
+    if pattern == "sine":
+        return np.array([[0.0, 0.5], [1.0, 0.5]])
+    if pattern != "stripes":
+        return np.empty((0, 2))
+    odd = np.arange(1, np.clip(5 * period_px, 15, 999), 2)
+    return np.array([[0.0, 0.5], *((m, 2 / (np.pi * m)) for m in odd)])
+
+
+@lru_cache(maxsize=1)
+def _disc_table() -> tuple[np.ndarray, float]:
+    """The transfer of a uniform disc over diameter × frequency, and the step."""
+    cycles = np.linspace(0, 64, 1 << 14)
+    return disc_transfer(cycles), float(cycles[1])
 
 
 def _camera(rig: Rig, channel: Channel) -> np.ndarray:
@@ -458,13 +483,14 @@ def _falloff(rig: Rig, channel: Channel) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _points(count: int, dimensions: int) -> np.ndarray:
-    """``count`` points of the unit cube that fill it evenly (scrambled Sobol), [count dimensions].
+    """``count`` points that fill a cube of side 2³² evenly (Sobol), uint32 [count dimensions].
 
-    Every pixel turns them by amounts of its own.
+    Every pixel moves them by amounts of its own.
     """
     from scipy.stats import qmc
 
-    return qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(0)).random(count)
+    points = qmc.Sobol(dimensions, scramble=False).random(count)
+    return (points * 2.0**32).astype(np.uint32)
 
 
 @lru_cache(maxsize=8)

@@ -32,7 +32,8 @@ _CONFIG = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 _PILE_ATTEMPTS = 60
 _IN_VIEW = 0.92
 """Of half the field of view: how far from the middle a pile's parts may come to rest."""
-_MARK_LIFT_MM = 0.005
+MARK_LIFT_MM = 0.005
+"""How far the marks of a card lie above it."""
 
 
 class Range(pydantic.BaseModel):
@@ -179,7 +180,7 @@ class Grid(_Series):
             pose = np.eye(4)
             pose[2, 3] = distance
             above = pose.copy()
-            above[2, 3] -= _MARK_LIFT_MM
+            above[2, 3] -= MARK_LIFT_MM
             reach = 1.2 * distance * max(around.half_view_mm()) / around.table.distance_mm
             bodies = [
                 Body("plane", square(), pose, self.albedo, 1),
