@@ -49,7 +49,7 @@ def require_engine() -> None:
 
 
 def drop(
-    meshes: Sequence[Mesh], spread_mm: float, seed: Sequence[int], height_mm: float = 60.0
+    meshes: Sequence[Mesh], spread_mm: float, seed: Sequence[int], height_mm: float = 15.0
 ) -> Pile:
     """Let ``meshes`` fall one by one, turned at random, within ``spread_mm`` of the middle.
 
@@ -67,7 +67,7 @@ def drop(
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10
     spec.option.noslip_iterations = 4
-    friction = [0.5, 0.005, 0.0001]
+    friction = [0.7, 0.005, 0.0001]
     # Stiff contacts: parts of some tens of grams sink by micrometres.
     contact: dict[str, Any] = {
         "friction": friction,

@@ -73,13 +73,13 @@ def render(
     ``paths`` is the number of rays for each pixel and image, a power of two.  Raises
     :class:`DataError` for a body that reaches the lens, and for a rig without a projector.
     """
-    _require_in_front(rig, bodies)
+    require_in_front(rig, bodies)
     with ThreadPoolExecutor(workers or os.cpu_count()) as pool:
         return _Tracer(rig, bodies, lighting or Lighting(), paths, seed, pool).rendering()
 
 
-def _require_in_front(rig: Rig, bodies: Sequence[Body]) -> None:
-    """Everything has to stand farther off than the lens's focal length, where images are real."""
+def require_in_front(rig: Rig, bodies: Sequence[Body]) -> None:
+    """Raise :class:`DataError` for a body within the focal length, of which no image is real."""
     for body in bodies:
         if body.instance == 0 or len(body.mesh.triangles) < 3:
             nearest = float(body.camera_from_object[2, 3])  # planes reach anywhere but to the lens

@@ -24,12 +24,12 @@ import pydantic
 
 from stages.optics.rig import Rig, mistake
 from stages.simulation.bodies import Body, Mesh, load_mesh, marks, square
-from stages.simulation.render import Lighting
+from stages.simulation.render import Lighting, require_in_front
 from stages.simulation.sensor import Exposure, Sensor
 from workbench.errors import DataError
 
 _CONFIG = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-_PILE_ATTEMPTS = 60
+_PILE_ATTEMPTS = 20
 _IN_VIEW = 0.92
 """Of half the field of view: how far from the middle a pile's parts may come to rest."""
 MARK_LIFT_MM = 0.005
@@ -134,7 +134,9 @@ class _Series(pydantic.BaseModel, ABC):
         """One maker for each frame.  Raises :class:`DataError` for what cannot be built."""
 
 
-def _ready(spec: FrameSpec) -> Maker:
+def _ready(around: Surroundings, spec: FrameSpec) -> Maker:
+    """Raises :class:`DataError` for a body that reaches the lens."""
+    require_in_front(around.rig, spec.bodies)
     return lambda _: spec
 
 
@@ -161,7 +163,7 @@ class Planes(_Series):
                 if tilt:
                     meta |= {"tilt": tilt, "tilt_direction": direction}
                 spec = FrameSpec([Body("plane", square(), pose, self.albedo, 1)], meta)
-                one = _ready(spec)
+                one = _ready(around, spec)
                 yield from [one] * self.shots
 
 
@@ -195,7 +197,7 @@ class Grid(_Series):
                 "mark": self.mark_mm,
                 "pattern": "none",
             }
-            yield _ready(FrameSpec(bodies, meta, pattern_off=True))
+            yield _ready(around, FrameSpec(bodies, meta, pattern_off=True))
 
 
 class Pose(_Series):
@@ -230,7 +232,7 @@ class Pose(_Series):
                             spec.meta["tilt_direction"] = direction
                         if self.faces == "stable":
                             spec.meta["face"] = face
-                        yield _ready(spec)
+                        yield _ready(around, spec)
 
     def _frame(
         self, around: Surroundings, name: str, mesh: Mesh, world_rotation: np.ndarray
@@ -286,7 +288,7 @@ class Occlusion(_Series):
                 middle = (near + far) / 2
                 near, far = (middle, far) if hidden(middle) > wanted else (near, middle)
             meta = {"kind": "occlusion", "occlusion": round(hidden(far), 4), "offset_mm": far}
-            yield _ready(FrameSpec([bottom, held(far), around.table.body()], meta))
+            yield _ready(around, FrameSpec([bottom, held(far), around.table.body()], meta))
 
 
 class Pile(_Series):
@@ -300,7 +302,7 @@ class Pile(_Series):
     """Fewest and most pieces in a pile."""
     albedo: tuple[Albedo, Albedo] = (0.35, 0.65)
     """Least and greatest albedo of a piece."""
-    spread_mm: pydantic.NonNegativeFloat = 40.0
+    spread_mm: pydantic.NonNegativeFloat = 30.0
     """How far from the middle the pieces fall."""
 
     @pydantic.model_validator(mode="after")
@@ -332,16 +334,25 @@ class Pile(_Series):
         albedo = rng.uniform(*self.albedo, count)
         meshes = [around.mesh(name) for name in chosen]
         across, down = around.half_view_mm()
+        # Parts roll and pile up: of a few piles the one with the fewest parts out of view, or
+        # nearer than the near focal plane.
+        highest = around.table.distance_mm - around.rig.near_focus_mm
+        best, fewest = None, count + 1
         for attempt in range(_PILE_ATTEMPTS):
             pile = drop(meshes, self.spread_mm, [*seed, attempt])
-            x, y = np.abs(pile.world_from_object[:, :2, 3]).max(axis=0)
-            if x < _IN_VIEW * across and y < _IN_VIEW * down and pile.at_rest:
+            apart = np.abs(pile.world_from_object[:, :2, 3]) / (across, down)
+            top = [
+                float((mesh.vertices_mm @ pose[2, :3] + pose[2, 3]).max())
+                for mesh, pose in zip(meshes, pile.world_from_object, strict=True)
+            ]
+            out = (apart > _IN_VIEW).any(axis=1) | (np.array(top) > highest)
+            if pile.at_rest and out.sum() < fewest:
+                best, fewest = pile, int(out.sum())
+            if fewest == 0:
                 break
-        else:
-            raise DataError(
-                f"a pile of {count} parts does not come to rest in view: expected fewer or smaller "
-                f"parts, or less spread_mm than {self.spread_mm:g}"
-            )
+        if best is None:
+            raise DataError(f"a pile of {count} parts does not come to rest")
+        pile = best
         world = around.table.camera_from_world()
         bodies = [
             Body(name, mesh, world @ pose, float(a), k + 1)
@@ -377,6 +388,16 @@ class SceneFile(pydantic.BaseModel):
     parts: dict[str, str] = {}
     """Name to mesh, a path from the scene file's folder."""
     series: list[Series] = pydantic.Field(min_length=1)
+
+    @pydantic.field_validator("rig", mode="before")
+    @classmethod
+    def _table_or_path(cls, rig: Any) -> Any:
+        if not isinstance(rig, Mapping):
+            return rig
+        try:
+            return Rig.model_validate(rig)
+        except pydantic.ValidationError as error:
+            raise ValueError(f"rig: {mistake(error)}") from error
 
     @pydantic.field_validator("paths")
     @classmethod
