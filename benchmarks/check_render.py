@@ -15,55 +15,33 @@ from pathlib import Path
 import numpy as np
 
 from stages.optics.rig import Rig
-from stages.simulation.bodies import Body, Mesh, load_mesh, marks, square
+from stages.simulation.again import bodies_of
+from stages.simulation.bodies import load_mesh
 from stages.simulation.render import render
-from workbench.recording import Frame, Recording
+from stages.simulation.scene import Table
+from workbench.recording import Recording
 
 PARTS = Path(__file__).parents[1] / "recordings" / "parts"
 EXPOSURE = 0.78 / 0.55
-
-
-def bodies_of(frame: Frame, table_mm: float) -> list[Body]:
-    """The frame's objects where its transforms say, and the table."""
-    truth = frame.truth
-    assert truth is not None
-    found = []
-    for entry in truth.meta["objects"]:
-        pose = truth.camera_from_object[f"object_{entry['id']}_{entry['name']}"].copy()
-        pose[:3, 3] *= 1e3
-        mesh: Mesh = (
-            square() if entry["name"] == "plane" else load_mesh(PARTS / f"{entry['name']}.stl")
-        )
-        found.append(Body(entry["name"], mesh, pose, entry["albedo"], entry["id"]))
-        if truth.meta["kind"] == "grid":
-            pose = pose.copy()
-            pose[2, 3] -= 0.005
-            found.append(
-                Body("marks", marks(truth.meta["pitch"], truth.meta["mark"], 150), pose, 0.6, 2)
-            )
-    if not any(body.name == "plane" for body in found):
-        table = np.eye(4)
-        table[2, 3] = table_mm
-        found.append(Body("table", square(), table, 0.05, 0))
-    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("recording", type=Path)
     parser.add_argument("--frames", type=int, default=None)
-    parser.add_argument("--paths", type=int, default=128)
+    parser.add_argument("--paths", type=int, default=64)
     parser.add_argument("--pictures", type=Path)
     arguments = parser.parse_args()
     recording = Recording.open(arguments.recording)
     rig = Rig.from_metadata(recording.rig)
-    table_mm = float(recording.rig.get("z_table", 795))
+    table = Table(distance_mm=float(recording.rig.get("z_table", 795)))
+    meshes = {path.stem: load_mesh(path) for path in sorted(PARTS.glob("*.stl"))}
     print("frame    depth mm  differ px   near %    far %   flat %   seconds")
     for frame in recording.frames(["near", "far"], ["flat"], 0, arguments.frames):
         assert frame.truth is not None and frame.truth.depth_m is not None
         begun = time.perf_counter()
         pattern_off = frame.truth.meta.get("pattern") == "none"
-        made = render(rig, bodies_of(frame, table_mm), paths=arguments.paths)
+        made = render(rig, bodies_of(frame.truth, meshes, table), paths=arguments.paths)
         seconds = time.perf_counter() - begun
         same = made.instances == frame.truth.instances
         depth = np.abs(made.depth_mm - 1e3 * frame.truth.depth_m)[same].max()
@@ -72,9 +50,10 @@ def main() -> None:
             if channel not in frame.images:
                 rms.append(np.nan)
                 continue
-            light = made.light[channel] * EXPOSURE * (0.9 if channel == "flat" else 1.0)
-            if pattern_off and channel != "flat":
-                light = made.light["flat"] * EXPOSURE
+            if channel == "flat":
+                light = 0.9 * EXPOSURE * made.open_light["near"]
+            else:
+                light = EXPOSURE * (made.open_light if pattern_off else made.light)[channel]
             error = np.clip(light, 0, 1) - frame.images[channel] / 255
             rms.append(100 * float(np.sqrt((error**2).mean())))
             if arguments.pictures:

@@ -420,6 +420,22 @@ def train(
     )
 
 
+@app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="The scene file, TOML.", metavar="SCENE")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write.")],
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of everything random; the same seed, the same bytes.")
+    ] = 0,
+    frames: Frames = None,
+    as_json: Json = False,
+) -> None:
+    """Render a scene file to a recording with ground truth."""
+    from workbench.commands import simulate as command
+
+    command.run(scene, output, seed, parse_frames(frames), as_json)
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
     interrupts.install()

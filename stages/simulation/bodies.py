@@ -18,6 +18,9 @@ _SAME_DIRECTION = np.cos(np.deg2rad(0.5))
 _SAME_OFFSET = 1e-3
 """Of the mesh's size: how far apart two faces of one plane may lie."""
 
+_CENTRED_MM = 0.01
+"""A mesh whose centroid is this near its origin is left as it is."""
+
 PLANE_HALF_SIZE_MM = 1500.0
 """Half the side of the squares that stand for planes without end."""
 
@@ -87,17 +90,34 @@ def load_mesh(path: Path) -> Mesh:
     if not path.is_file():
         raise DataError(f"{path}: expected a mesh, found no such file")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        read = o3d.io.read_triangle_mesh(str(path))
+        read = o3d.io.read_triangle_mesh(path)
     read.remove_duplicated_vertices()
     read.remove_degenerate_triangles()
     vertices = np.asarray(read.vertices, float)
     triangles = np.asarray(read.triangles, np.int32)
     if not len(triangles) or not np.isfinite(vertices).all():
         raise DataError(f"{path}: expected a mesh that Open3D reads, found no triangles in it")
-    mesh = Mesh(vertices, triangles)
+    mesh = _centred(Mesh(vertices, triangles))
     # Slivers have no normal.
     sound = np.isfinite(mesh.normals).all(1)
-    return mesh if sound.all() else Mesh(vertices, triangles[sound])
+    return mesh if sound.all() else Mesh(mesh.vertices_mm, triangles[sound])
+
+
+def _centred(mesh: Mesh) -> Mesh:
+    """The mesh with its origin at its centroid, where the convention has it.
+
+    The centroid is that of the volume, or of the corners where the mesh encloses none.
+    """
+    a, b, c = (mesh.vertices_mm[mesh.triangles[:, k]] for k in range(3))
+    sixfold = (a * np.cross(b, c)).sum(1)
+    volume = sixfold.sum()
+    if volume > 1e-6 * np.ptp(mesh.vertices_mm, axis=0).max() ** 3:
+        centroid = (sixfold[:, None] * (a + b + c)).sum(0) / (4 * volume)
+    else:
+        centroid = mesh.vertices_mm.mean(0)
+    if np.linalg.norm(centroid) < _CENTRED_MM:
+        return mesh
+    return Mesh(mesh.vertices_mm - centroid, mesh.triangles)
 
 
 def square(half_size_mm: float = PLANE_HALF_SIZE_MM) -> Mesh:
