@@ -244,7 +244,7 @@ def calibrate(
         typer.Argument(
             help="The recording of known planes; with --from-optics, one of any scene that "
             "tells the images' size.",
-            metavar="[REC]",
+            metavar="REC",
         ),
     ] = None,
     from_optics: Annotated[
