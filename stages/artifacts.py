@@ -59,6 +59,7 @@ GAIN_DRIFT = Artifact("gain_drift", doc="near over far light, against the calibr
 
 FOCUS_NEAR = Artifact("focus_near", "float32", "H W", "grey levels", "focus measure, near")
 FOCUS_FAR = Artifact("focus_far", "float32", "H W", "grey levels", "focus measure, far")
+FOCUS_NOISE = Artifact("focus_noise", doc="noise of the images in which focus was measured")
 
 DEPTH = Artifact("depth_m", "float32", "H W", "m", "z along the optical axis; NaN where unknown")
 RELATIVE = Artifact(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from stages.artifacts import (
@@ -16,6 +16,7 @@ from stages.artifacts import (
     FAR,
     FOCUS_FAR,
     FOCUS_NEAR,
+    FOCUS_NOISE,
     INTENSITY,
     NEAR,
     NEAR_CAMERA,
@@ -56,6 +57,7 @@ class DepthCloud(Stage):
     needs = (
         FOCUS_NEAR,
         FOCUS_FAR,
+        FOCUS_NOISE,
         NEAR,
         FAR,
         INTENSITY,
@@ -96,6 +98,15 @@ class DepthCloud(Stage):
             step=0.1,
             unit="% of working range",
         )
+        texture_half_confidence_error_percent: float = knob(
+            12.0,
+            "The same where depth comes from the scene's own texture and the optics alone: what "
+            "lies in a window differs from place to place, and so does its blur.",
+            low=0.2,
+            high=100,
+            step=0.5,
+            unit="% of working range",
+        )
         min_confidence: float = knob(
             0.5,
             "Depth of less confidence than this is given as unknown.",
@@ -132,7 +143,7 @@ class DepthCloud(Stage):
         measured = _measure(inputs, parameters)
         windows, relative, confidence = measured.windows, measured.relative, measured.confidence
         relative[_unsure(measured, parameters)] = np.nan
-        if calibration is not None:
+        if calibration is not None and calibration.modulation.size:
             folded = dfd.folded_back(
                 inputs["focus_near"] + inputs["focus_far"],
                 measured.brightness,
@@ -187,7 +198,13 @@ class DepthCloud(Stage):
         artifacts = logged.artifacts
         depth_m, confidence = artifacts["depth_m"], artifacts["confidence"]
         calibration = artifacts.get("calibration")
-        if calibration is not None:
+        if calibration is not None and calibration.texture is not None:
+            # The range may be wide: in 1/z, in which it is measured, it is seen evenly.
+            low, middle, high = (float(z) for z in calibration.z_m(np.array([0, 0.5, 1])))
+            ticks = (f"{1e3 * low:.0f} mm", f"{1e3 * middle:.0f} mm", f"{1e3 * high:.0f} mm")
+            relative = artifacts["depth_relative"]
+            show.log_map(recording, "depth_cloud/depth", relative, 0, 1, "turbo", ticks)
+        elif calibration is not None:
             low, high = calibration.near_z_m, calibration.far_z_m
             middle = (low + high) / 2
             ticks = (f"{1e3 * low:.0f} mm", f"{1e3 * middle:.0f} mm", f"{1e3 * high:.0f} mm")
@@ -287,9 +304,8 @@ class DepthCloud(Stage):
         measured = _measure({need.name: artifacts.get(need.name) for need in self.needs}, p)
         relative, confidence = measured.relative[y, x], measured.confidence[y, x]
         error = measured.error_percent[y, x]
-        trust = dfd.confidence_from_error(
-            measured.error_percent[y : y + 1, x : x + 1], p.half_confidence_error_percent
-        )[0, 0]
+        half_name, half = _half_confidence(calibration, p)
+        trust = dfd.confidence_from_error(measured.error_percent[y : y + 1, x : x + 1], half)[0, 0]
         given = {
             "depth_m": artifacts["depth_m"][y, x],
             "depth_relative": artifacts["depth_relative"][y, x],
@@ -306,7 +322,7 @@ class DepthCloud(Stage):
             Finding(
                 f"predicted error {error:.2f} % of the working range: confidence {trust:.3f}",
                 {"error_percent": error},
-                "half_confidence_error_percent",
+                half_name,
             ),
         ]
         share = measured.saturated_share
@@ -346,7 +362,7 @@ class DepthCloud(Stage):
             )
         )
         folded = False
-        if calibration is not None:
+        if calibration is not None and calibration.modulation.size:
             kept = measured.relative.copy()
             kept[_unsure(measured, p)] = np.nan
             cells = dfd.contrast_of_cells(
@@ -414,6 +430,14 @@ def _unsure(measured: _Measured, parameters: Any) -> Any:
     )
 
 
+def _half_confidence(calibration: Any, parameters: Any) -> tuple[str, float]:
+    """Name and value of the parameter that says at which predicted error confidence is one half."""
+    of_texture = calibration is not None and calibration.texture is not None
+    name = "half_confidence_error_percent"
+    name = f"texture_{name}" if of_texture else name
+    return name, getattr(parameters, name)
+
+
 def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
     """Relative depth and its confidence at every pixel."""
     import cv2
@@ -425,8 +449,13 @@ def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
 
     calibration, stripes = inputs["calibration"], inputs["stripes"]
     near, far = inputs["near"], inputs["far"]
-    period_px = stripes.extent_px() if stripes is not None else _WINDOW_WITHOUT_STRIPES_PX
+    texture = calibration.texture if calibration is not None else None
+    scale_px = texture.scale_px if texture is not None else 1
+    period_px = _WINDOW_WITHOUT_STRIPES_PX if stripes is None else stripes.extent_px()
+    period_px *= scale_px
     windows = dfd.windows_for(period_px, parameters.smoothing_periods, parameters.reach_periods)
+    # The pixels of an image that was shrunk are all the independent samples that there are.
+    windows = replace(windows, samples=max(1.0, windows.samples / scale_px**2))
     taps = whole_period_taps(min(period_px, *near.shape))
     brightness = cv2.sepFilter2D(
         near + far, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
@@ -434,9 +463,9 @@ def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
     if calibration is not None:
         response = dfd.Response(
             calibration.curve,
-            calibration.modulation,
+            calibration.modulation if calibration.modulation.size else None,
             calibration.slope,
-            calibration.noise,
+            inputs["focus_noise"],
             calibration.laplacian,
         )
     else:
@@ -450,7 +479,9 @@ def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
         windows,
         parameters.edge_aware,
     )
-    confidence = dfd.confidence_from_error(error_percent, parameters.half_confidence_error_percent)
+    confidence = dfd.confidence_from_error(
+        error_percent, _half_confidence(calibration, parameters)[1]
+    )
     share = None
     if inputs["saturated"].any():
         share = cv2.blur(

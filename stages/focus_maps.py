@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from stages.artifacts import CALIBRATION, FAR, FOCUS_FAR, FOCUS_NEAR, NEAR, STRIPES
+from stages.artifacts import (
+    CALIBRATION,
+    FAR,
+    FOCUS_FAR,
+    FOCUS_NEAR,
+    FOCUS_NOISE,
+    NEAR,
+    STRIPES,
+)
 from workbench.stage import (
     WARNINGS,
     Finding,
@@ -21,13 +29,15 @@ from workbench.stage import (
 class FocusMaps(Stage):
     """Energy behind a 5×5 Laplacian, over a window of whole stripe periods, for both images.
 
-    Where the near map is the stronger, the surface is nearer to the near focal plane.
+    Where the near map is the stronger, the surface is nearer to the near focal plane.  With a
+    calibration from optics alone the maps are what a texture of one known spectrum would have
+    shown at the same blur (see ``stages/dfd/texture.py``).
     """
 
     name = "focus_maps"
     chapter = "sensor"
     needs = (NEAR, FAR, STRIPES, CALIBRATION)
-    gives = (FOCUS_NEAR, FOCUS_FAR)
+    gives = (FOCUS_NEAR, FOCUS_FAR, FOCUS_NOISE)
 
     class Parameters(StageParameters):
         laplacian: Literal["opencv", "paper"] = knob(
@@ -46,7 +56,8 @@ class FocusMaps(Stage):
         )
         window_px: float = knob(
             9,
-            "Side of the window where no stripes are found (texture alone, as in photographs).",
+            "Side of the window where no stripes are found (texture alone, as in photographs); "
+            "where blur is so large that focus is measured on shrunk images, in their pixels.",
             low=3,
             high=63,
             step=2,
@@ -63,6 +74,7 @@ class FocusMaps(Stage):
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         from stages.dfd.focus import SensorNoise, focus_map
         from stages.dfd.stripes import whole_period_taps
+        from stages.dfd.texture import texture_focus_maps, texture_taps
 
         calibration = inputs["calibration"]
         warnings = []
@@ -71,16 +83,27 @@ class FocusMaps(Stage):
                 f"laplacian is {parameters.laplacian}, the calibration was made with "
                 f"{calibration.laplacian}: depth will be off"
             )
-        noise = None
-        if parameters.subtract_noise:
-            noise = calibration.noise if calibration is not None else SensorNoise()
+        known = calibration.noise if calibration is not None else SensorNoise()
+        texture = calibration.texture if calibration is not None else None
         side = window_side_px(inputs["stripes"], parameters)
-        height, width = inputs["near"].shape
-        x_taps = whole_period_taps(min(side, width))
-        y_taps = whole_period_taps(min(side, height))
+        near, far = inputs["near"], inputs["far"]
+        scale = texture.scale_px if texture is not None else 1
+        alone = texture is not None and inputs["stripes"] is None
+        taps_of = texture_taps if alone else whole_period_taps
+        x_taps, y_taps = (taps_of(min(side, max(1, size // scale))) for size in near.shape[::-1])
+        kind, subtract = parameters.laplacian, parameters.subtract_noise
+        if texture is not None:
+            focus_near, focus_far, known = texture_focus_maps(
+                near, far, texture, x_taps, y_taps, kind, subtract, striped=not alone
+            )
+        else:
+            noise = known if subtract else None
+            focus_near = focus_map(near, x_taps, y_taps, kind, noise)
+            focus_far = focus_map(far, x_taps, y_taps, kind, noise)
         return {
-            "focus_near": focus_map(inputs["near"], x_taps, y_taps, parameters.laplacian, noise),
-            "focus_far": focus_map(inputs["far"], x_taps, y_taps, parameters.laplacian, noise),
+            "focus_near": focus_near,
+            "focus_far": focus_far,
+            "focus_noise": known,
             WARNINGS: warnings,
         }
 

@@ -39,6 +39,8 @@ class Registration(Stage):
     """Takes the far image onto the near image's grid, and makes an image without stripes.
 
     The similarity comes from the calibration; without one it is measured on the frame itself.
+    So it is with a calibration from optics alone, which knows where to begin, and so is then the
+    balance of light over the image.
     What misalignment is left, and how the balance of light between the sensors has drifted since
     the calibration, are measured on every frame and told.
     """
@@ -51,8 +53,8 @@ class Registration(Stage):
     class Parameters(StageParameters):
         similarity: Literal["calibration", "pair", "none"] = knob(
             "calibration",
-            "Where the far-to-near map comes from: the calibration (without one, the pair), "
-            "each frame's own image pair, or nowhere.",
+            "Where the far-to-near map comes from: the calibration (without one, or with one from "
+            "optics alone, the pair), each frame's own image pair, or nowhere.",
         )
         intensity: Literal["flat", "stripes"] = knob(
             "flat",
@@ -74,12 +76,19 @@ class Registration(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+        from dataclasses import replace
+
         import cv2
         import numpy as np
 
-        from stages.dfd.calibration import light_ratio
+        from stages.dfd.calibration import light_ratio, pair_gain
         from stages.dfd.images import full_scale, grey
-        from stages.dfd.similarity import Similarity, misalignment_rms_px, refine_similarity
+        from stages.dfd.similarity import (
+            Similarity,
+            align_pair,
+            misalignment_rms_px,
+            refine_similarity,
+        )
         from stages.dfd.similarity import warp_to_near as warp
         from stages.dfd.stripes import average_over_period, measure_stripes
 
@@ -94,22 +103,27 @@ class Registration(Stage):
         warnings: list[str] = []
 
         similarity = Similarity.identity(width, height)
+        from_optics = calibration is not None and calibration.texture is not None
         if calibration is not None:
             known = calibration.similarity
+            if from_optics and known.width == 0:
+                known = replace(known, width=width, height=height)
             if (known.width, known.height) != (width, height):
                 raise StageError(
                     f"the calibration is for {known.width}×{known.height} pixels, "
                     f"the images are {width}×{height}"
                 )
-            if parameters.similarity == "calibration":
+            if parameters.similarity == "calibration" and not from_optics:
                 similarity = known
-        if parameters.similarity == "pair" or (
+        if from_optics and parameters.similarity != "none":
+            similarity = align_pair(near, far, [known, similarity])
+        elif parameters.similarity == "pair" or (
             parameters.similarity == "calibration" and calibration is None
         ):
             similarity = refine_similarity([(near, far)], similarity)
         flat = inputs["flat_image"]
         top = full_scale(*(image for image in (near_raw, far_raw, flat) if image is not None))
-        if calibration is not None and np.isfinite(top):
+        if calibration is not None and not from_optics and np.isfinite(top):
             if top == calibration.full_scale or (
                 near_raw.dtype != np.uint8 and top < calibration.full_scale
             ):
@@ -130,7 +144,12 @@ class Registration(Stage):
         far = warp(np.nan_to_num(far, copy=False), similarity)
 
         gain_drift = 1.0
-        if calibration is not None:
+        if from_optics:
+            gain = pair_gain(near, far, similarity)
+            gain_drift = float(gain.mean())
+            if parameters.correct_gain:
+                far = far * gain
+        elif calibration is not None:
             gain_drift = light_ratio(near, far, calibration.gain_map)
             if abs(gain_drift - 1) > _GAIN_WARNING:
                 done = "corrected" if parameters.correct_gain else "not corrected"
@@ -140,7 +159,13 @@ class Registration(Stage):
                 )
             if parameters.correct_gain:
                 far = far * np.float32(gain_drift)
-        stripes = calibration.stripes if calibration is not None else measure_stripes(near)
+        if calibration is not None and not from_optics:
+            stripes = calibration.stripes
+        elif from_optics and calibration.texture.scale_px > 1:
+            # Focus is measured on shrunk images, which no stripes survive.
+            stripes = None
+        else:
+            stripes = measure_stripes(near)
         drift_px = misalignment_rms_px(near, far)
         if drift_px > _DRIFT_WARNING_PX:
             warnings.append(f"near and far are {drift_px:.1f} px apart after registration")

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from workbench.recording.writer import foxglove, foxglove_schema
+
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 DIALECTS = ("protobuf", "json", "ros2")
@@ -212,20 +214,11 @@ class Recorder:
 def _schema(name: str, encoding: str) -> tuple[str, bytes]:
     if encoding != "protobuf":
         return ("jsonschema", b"{}") if encoding == "json" else (encoding, b"")
-    from mcap_protobuf.schema import build_file_descriptor_set
-
-    return "protobuf", build_file_descriptor_set(_class(name)).SerializeToString()
-
-
-def _class(name: str) -> Any:
-    import importlib
-
-    short = name.removeprefix("foxglove.")
-    return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{short}_pb2"), short)
+    return "protobuf", foxglove_schema(name.removeprefix("foxglove."))
 
 
 def _message(schema: str, fields: Mapping[str, Any]) -> Any:
-    message = _class(schema)()
+    message = foxglove(schema.removeprefix("foxglove."))()
     for name, value in fields.items():
         if name == "timestamp":
             message.timestamp.seconds, message.timestamp.nanos = divmod(value, 10**9)

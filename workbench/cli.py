@@ -124,6 +124,14 @@ def parse_topics(texts: list[str]) -> dict[str, str]:
     return topics
 
 
+def parse_size(flag: str, text: str) -> tuple[int, int]:
+    """``WxH`` as (width, height).  Raises :class:`UsageError`."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise UsageError(f"{flag} {text}: expected WxH in pixels, such as 1920x1080")
+    return int(width), int(height)
+
+
 @app.command()
 def replay(
     recording: Rec,
@@ -288,19 +296,149 @@ def compare(
 
 @app.command()
 def calibrate(
-    recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],
+    recording: Annotated[
+        Path | None,
+        typer.Argument(
+            help="The recording of known planes; with --from-optics, one of any scene that "
+            "tells the images' size.",
+            metavar="REC",
+        ),
+    ] = None,
+    from_optics: Annotated[
+        Path | None,
+        typer.Option(
+            "--from-optics",
+            help="Calibrate from the lens's data alone: a rig.toml, or a recording that has a rig.",
+            metavar="RIG",
+        ),
+    ] = None,
+    image_size: Annotated[
+        str | None,
+        typer.Option(
+            "--image-size",
+            help="With --from-optics and no recording: the size of the images; any, if not given.",
+            metavar="WxH",
+        ),
+    ] = None,
     assignments: Set = None,
     topic: Topic = None,
     plugin: Plugin = None,
     as_json: Json = False,
 ) -> None:
-    """Calibrate from a recording of known planes (and dot grids), with a report."""
+    """Calibrate from a recording of known planes (and dot grids), or from the optics alone.
+
+    From the optics alone depth comes from the texture of the scene itself: for pictures with lens
+    data (focal_length_mm, f_number, pixel_pitch_mm, near_focus_mm, far_focus_mm in a TOML file)
+    and no planes of known distance.  The report says what is assumed.
+    """
     from workbench.commands import calibrate as command
 
-    command.run(
-        recording, output, assignments or [], parse_topics(topic or []), plugin or [], as_json
+    topics, plugins = parse_topics(topic or []), plugin or []
+    if from_optics is not None:
+        size = None if image_size is None else parse_size("--image-size", image_size)
+        command.run_from_optics(
+            from_optics, recording, size, output, assignments or [], topics, plugins, as_json
+        )
+        return
+    if recording is None:
+        raise UsageError("calibrate: expected a recording of known planes, or --from-optics")
+    if image_size is not None:
+        raise UsageError("--image-size: expected with --from-optics")
+    command.run(recording, output, assignments or [], topics, plugins, as_json)
+
+
+@app.command("import")
+def import_(
+    output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write.")],
+    near: Annotated[
+        str | None,
+        typer.Option(
+            help="The near-focused image: a file, a folder, or a pattern with one * (quoted).",
+            metavar="FILES",
+        ),
+    ] = None,
+    far: Annotated[
+        str | None, typer.Option(help="The far-focused image, likewise.", metavar="FILES")
+    ] = None,
+    flat: Annotated[
+        str | None,
+        typer.Option(
+            help="An image without projected pattern on the near one's grid, likewise.",
+            metavar="FILES",
+        ),
+    ] = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option(help="Images of any other channel, likewise.", metavar="CHANNEL=FILES"),
+    ] = None,
+    stack: Annotated[
+        Path | None,
+        typer.Option(
+            help="A focal stack in place of pairs, nearest focus first: a folder, or a TIFF with "
+            "pages.",
+        ),
+    ] = None,
+    planes: Annotated[
+        str | None,
+        typer.Option(
+            help="Which two images of the stack are near and far, counted from 0; else the two "
+            "between which the scene is sharp.",
+            metavar="I,J",
+        ),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(help="The optics (TOML): gives the recording its cameras and its rig."),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames a second; else the times in the images (EXIF), else one a second.",
+            metavar="HZ",
+        ),
+    ] = None,
+    transfer: Annotated[
+        str,
+        typer.Option(
+            help="How grey levels follow light: linear (stored as they are), or srgb, as cameras "
+            "develop JPEGs (stored as linear 16 bit).",
+            metavar="linear|srgb",
+        ),
+    ] = "linear",
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Make a recording of image files: one pair, folders of pairs, or a focal stack.
+
+    Files of two folders belong together if their names are alike, else by their order.  PNG and
+    JPEG files are stored byte for byte, anything else as PNG.
+    """
+    from workbench.commands import import_ as command
+
+    if transfer not in ("linear", "srgb"):
+        raise UsageError(f"--transfer {transfer}: expected linear or srgb")
+    sources = {
+        name: text
+        for name, text in (("near", near), ("far", far), ("flat", flat))
+        if text is not None
+    }
+    for text in channel or []:
+        name, equals, files = text.partition("=")
+        if not (name and equals and files) or not name.replace("_", "").isalnum():
+            raise UsageError(f"--channel {text}: expected CHANNEL=FILES")
+        sources[name] = files
+    options = command.ImportOptions(
+        sources,
+        stack,
+        planes,
+        rig,
+        rate,
+        "srgb" if transfer == "srgb" else "linear",
+        output,
+        plugin or [],
     )
+    command.run(options, as_json)
 
 
 @app.command()
@@ -388,6 +526,22 @@ def why(
         recording, calibration, models, preset, config, assignments, topic, None, until, plugin
     )
     command.run(options, frame, pixel, stage, search, as_json, save, screenshot, window)
+
+
+@app.command()
+def simulate(
+    scene: Annotated[Path, typer.Argument(help="The scene file, TOML.", metavar="SCENE")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write.")],
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of everything random; the same seed, the same bytes.")
+    ] = 0,
+    frames: Frames = None,
+    as_json: Json = False,
+) -> None:
+    """Render a scene file to a recording with ground truth."""
+    from workbench.commands import simulate as command
+
+    command.run(scene, output, seed, parse_frames(frames), as_json)
 
 
 def main() -> None:

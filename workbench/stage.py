@@ -133,6 +133,11 @@ class Resource(Artifact):
     has ``report`` and ``save(path)``, and for ``train`` ``log(recording)``, which logs it to a
     ``rerun.RecordingStream`` and returns a blueprint.  ``filename`` is what is looked for beside
     a recording.
+
+    Where stages know their optics the object may also have ``rig_record(path, size)``, which reads
+    a rig file for images of that size and gives the metadata record ``rig`` and the K of each
+    channel, and ``OpticsParameters`` with ``from_optics(rig, size, parameters)``, which makes the
+    resource from a rig alone (a file, or that record).  Both raise ``ValueError`` with one line.
     """
 
     load: Callable[[Path], Any] | None = field(default=None, compare=False)

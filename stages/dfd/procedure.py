@@ -9,8 +9,9 @@ what is kept per pixel are the sums of the normal equations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,6 +21,7 @@ from scipy.optimize import nnls
 from stages.dfd.calibration import Calibration, gain_terms, light_ratio
 from stages.dfd.depth import windows_for
 from stages.dfd.focus import LaplacianKind, SensorNoise, focus_map
+from stages.dfd.from_optics import OpticsParameters, from_optics, read_rig, rig_record
 from stages.dfd.images import full_scale, grey
 from stages.dfd.score import PATCH_PX
 from stages.dfd.similarity import (
@@ -32,6 +34,7 @@ from stages.dfd.similarity import (
     warp_to_near,
 )
 from stages.dfd.stripes import Stripes, measure_stripes, whole_period_taps
+from stages.optics.rig import Rig
 from workbench.stage import StageParameters, knob
 
 _MIN_DOTS = 16
@@ -643,3 +646,15 @@ class Procedure:
 
     Parameters = CalibrateParameters
     run = staticmethod(calibrate)
+    OpticsParameters = OpticsParameters
+    rig_record = staticmethod(rig_record)
+
+    @staticmethod
+    def from_optics(
+        source: Path | Mapping[str, str],
+        size: tuple[int, int] | None,
+        parameters: Any,
+    ) -> Calibration:
+        """The calibration from a rig alone: a TOML file, or a recording's metadata."""
+        rig = read_rig(source, size) if isinstance(source, Path) else Rig.from_metadata(source)
+        return from_optics(rig, size, parameters)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numba
@@ -20,6 +20,7 @@ _OUTLIER_SIGMAS = 4.0
 _SMALLEST_FOR_DRIFT_PX = 32
 _DRIFT_ROWS = 64
 _DRIFT_SHRINK = 4
+_ALIGNING_SIDES_PX = (128, 256, 512, 1024)
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,17 @@ class Similarity:
                 [a, b, cx + self.dx_px - a * cx - b * cy],
                 [-b, a, cy + self.dy_px + b * cx - a * cy],
             ]
+        )
+
+    def resized(self, width: int, height: int) -> Similarity:
+        """The same map for the images shrunk or enlarged to ``width`` × ``height`` pixels."""
+        ratio = width / self.width
+        return replace(
+            self,
+            dx_px=self.dx_px * ratio,
+            dy_px=self.dy_px * ratio,
+            width=width,
+            height=height,
         )
 
     @property
@@ -264,6 +276,63 @@ def refine_similarity(
         if np.abs(step).max() < 1e-4:
             break
     return current
+
+
+def align_pair(near: np.ndarray, far: np.ndarray, starts: Sequence[Similarity]) -> Similarity:
+    """The similarity of one image pair [H W], from coarse to fine, for lenses that were refocused.
+
+    ``starts`` are guesses, and what the images say decides between them: a lens's data may be
+    off, or the pair may have been aligned before.  Each is refined on images shrunk to 128
+    pixels and more, so that misalignment of several per cent of the image is found; the finest
+    images have 1024 pixels, on which a tenth of a pixel is told.
+    """
+    height, width = near.shape
+    pyramid = []
+    for side in _ALIGNING_SIDES_PX:
+        factor = max(1.0, max(width, height) / side)
+        size = (max(1, round(width / factor)), max(1, round(height / factor)))
+        if min(size) >= _SMALLEST_FOR_DRIFT_PX:
+            pyramid.append(
+                (
+                    cv2.resize(near, size, interpolation=cv2.INTER_AREA),
+                    cv2.resize(far, size, interpolation=cv2.INTER_AREA),
+                )
+            )
+        if factor == 1:
+            break
+    if not pyramid:
+        return starts[0]
+
+    def refined(level: int, guess: Similarity) -> tuple[float, Similarity]:
+        """The guess made better on these images, or as it was, with the images' agreement."""
+        pair = pyramid[level]
+        known = guess.resized(pair[0].shape[1], pair[0].shape[0])
+        # From one level to the next there is little left to find.
+        better = refine_similarity([pair], known, iterations=3 if level else 12)
+        found = [(_agreement(*pair, one), one) for one in (known, better)]
+        return max(found, key=lambda one: one[0])
+
+    _, best = max((refined(0, guess) for guess in starts), key=lambda one: one[0])
+    for level in range(1, len(pyramid)):
+        _, best = refined(level, best)
+    return best.resized(width, height)
+
+
+def _agreement(near: np.ndarray, far: np.ndarray, similarity: Similarity) -> float:
+    """Correlation of the images, less their local means, where both have pixels; -1..1."""
+    seen = cv2.warpAffine(
+        np.ones(far.shape, np.uint8),
+        similarity.far_from_near,
+        (similarity.width, similarity.height),
+        flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+    )
+    if int(seen.sum()) < seen.size // 4:
+        return -1.0
+    inside = seen > 0
+    a = _equalised(near)[inside]
+    b = _equalised(warp_to_near(far, similarity))[inside]
+    norm = math.sqrt(float((a * a).sum()) * float((b * b).sum()))
+    return float((a * b).sum()) / norm if norm > 0 else -1.0
 
 
 def _equalised(image: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Reading MCAP recordings: frames of paired images, whatever state the file is in.
+"""Reading MCAP recordings: frames of paired images, whatever state the file is in; writing them.
 
     recording = Recording.open("piles.mcap")
     for frame in recording.frames(["near", "far"], optional=["flat"]):
@@ -13,6 +13,7 @@ from workbench.recording.defects import KINDS, Defect, DefectReport, Pairing
 from workbench.recording.images import ENCODINGS
 from workbench.recording.model import Camera, Frame, RecordingError, TopicInfo, Truth
 from workbench.recording.recording import Recording
+from workbench.recording.writer import RecordingWriter
 
 __all__ = [
     "ENCODINGS",
@@ -24,6 +25,7 @@ __all__ = [
     "Pairing",
     "Recording",
     "RecordingError",
+    "RecordingWriter",
     "TopicInfo",
     "Truth",
 ]

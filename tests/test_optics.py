@@ -1,0 +1,200 @@
+"""The rig and the thin lens: equations 1 and 2, reading and writing, and what cannot work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SCENE
+
+from stages.optics.analytic import (
+    disc_transfer,
+    pattern_mean,
+    pattern_value,
+    pattern_waves,
+    plane_image,
+    ratio,
+    shading,
+)
+from stages.optics.rig import Pattern, Projector, Rig
+from stages.optics.thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
+from workbench.recording import Recording
+
+
+def test_the_papers_numbers() -> None:
+    """700 mm and b = 0.8 mm put the far focal plane at 806 mm, and magnify by 1.0123."""
+    rig = Rig()
+    assert rig.sensor_mm("near") == pytest.approx(65.625)
+    assert rig.far_focus_mm == pytest.approx(806.1, abs=0.05)
+    assert rig.sensor_mm("near") / rig.sensor_mm("far") == pytest.approx(1.0123, abs=1e-4)
+    assert rig.period_px("near") == pytest.approx(5.0, abs=0.01)
+
+
+def test_blur_by_similar_triangles() -> None:
+    """Equation 1 from v, equation 2 from u: the same circle, and none at the focal plane."""
+    rig = Rig()
+    for channel in ("near", "far"):
+        s = rig.sensor_mm(channel)
+        for u in (650.0, 750.0, 900.0):
+            v = image_distance_mm(rig.focal_length_mm, u)
+            assert rig.blur_mm(channel, u) == pytest.approx(rig.aperture_mm * (s - v) / v)
+        assert rig.blur_mm(channel, rig.focus_mm(channel)) == pytest.approx(0, abs=1e-12)
+        assert rig.blur_px(channel, 650.0) < 0 < rig.blur_px(channel, 900.0)
+    assert blur_circle_mm(60, 20, 65, 700.0) == pytest.approx(2 * blur_circle_mm(60, 10, 65, 700.0))
+
+
+def test_lens_law_is_its_own_inverse() -> None:
+    for u in (80.0, 700.0, 5000.0):
+        assert object_distance_mm(60, image_distance_mm(60, u)) == pytest.approx(u)
+
+
+def test_metadata_of_a_recording_and_back() -> None:
+    recorded = Recording.open(SCENE).rig
+    rig = Rig.from_metadata(recorded)
+    assert rig == Rig()
+    written = rig.to_metadata()
+    # The table is the scene's, not the optics'.
+    assert {key: written.get(key) for key in recorded if key != "z_table"} == {
+        key: value for key, value in recorded.items() if key != "z_table"
+    }
+    again = Rig.from_metadata(written)
+    assert again.to_metadata() == written
+
+
+def test_toml_and_the_far_focus(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(
+        "focal_length_mm = 50.0\nnear_focus_mm = 400.0\nfar_focus_mm = 450.0\n"
+        "width_px = 320\nheight_px = 200\n[projector]\npattern = 'dots'\nfocus_mm = 420.0\n"
+    )
+    rig = Rig.from_toml(path)
+    assert rig.far_focus_mm == pytest.approx(450)
+    assert rig.centre_px == (159.5, 99.5)
+    assert rig.projector is not None and rig.projector.pattern == "dots"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("near_focus_mm = 50.0", "a lens of 60 mm cannot focus at 50 mm"),
+        ("sensor_separation_mm = 6.0", "is focused on nothing"),
+        ("far_focus_mm = 600.0", "expected beyond near_focus_mm 700"),
+        ("far_focus_mm = 'x'", "expected a number, found 'x'"),
+        ("far_focus_mm = 800.0\nsensor_separation_mm = 1.0", "found both"),
+        ("f_nummer = 2.0", "unknown key 'f_nummer'"),
+        ("f_number = -1.0", "f_number: Input should be greater than 0, got -1.0"),
+        ("projector.focus_mm = 3.0", "the projector: a lens of 60 mm cannot focus at 3 mm"),
+        ("projector.pattern = 'zebra'", "projector.pattern: "),
+        ("f_number = [", "not TOML"),
+    ],
+)
+def test_a_rig_that_cannot_be_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"rig\.toml: ") as raised:
+        Rig.from_toml(path)
+    assert says in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_metadata_without_optics_is_one_line() -> None:
+    with pytest.raises(ValueError, match="expected the key 'f'"):
+        Rig.from_metadata({"camera": "left"})
+    with pytest.raises(ValueError, match="f: expected a number, found 'long'"):
+        Rig.from_metadata({"f": "long"})
+
+
+def test_unique_range() -> None:
+    """The paper's pitch works at f/7 and not at f/2.8, where the ratio folds back."""
+    assert Rig().working_range_mm == pytest.approx((700, 806.1), abs=0.1)
+    fine = Rig(pixel_pitch_mm=0.02, f_number=7, projector=Projector(lines_per_mm=10))
+    assert fine.working_range_mm == pytest.approx((700, 806.1), abs=0.1)
+    folded = fine.model_copy(update={"f_number": 2.8})
+    with pytest.raises(ValueError, match="no unique range between the focal planes 700 and 806"):
+        _ = folded.working_range_mm
+
+
+def test_disc_transfer_is_that_of_a_disc() -> None:
+    """Against the sum over points of a disc, at frequencies on both sides of its zero."""
+    y, x = np.mgrid[-200:201, -200:201] / 400
+    inside = np.hypot(x, y) <= 0.5
+    for cycles in (0.0, 0.4, 1.0, 1.22, 2.0):
+        summed = np.cos(2 * np.pi * cycles * x[inside]).mean()
+        assert disc_transfer(cycles) == pytest.approx(summed, abs=2e-3)
+
+
+@pytest.mark.parametrize("pattern", ["stripes", "sine", "checker", "dots"])
+def test_waves_of_a_pattern_sum_to_it(pattern: Pattern) -> None:
+    y, x = np.mgrid[0:64, 0:64] / 64 + 1 / 128
+    summed = np.full(x.shape, pattern_mean(pattern))
+    for m, n, amplitude in pattern_waves(pattern):
+        summed += 2 * (amplitude * np.exp(2j * np.pi * (m * x + n * y))).real
+    value = pattern_value(pattern, x, y)
+    assert value.mean() == pytest.approx(pattern_mean(pattern), abs=0.01)
+    assert np.sqrt(((summed - value) ** 2).mean()) < 0.16  # what the cut-off series leaves
+
+
+def test_image_is_sharp_at_its_own_plane_and_blurred_at_the_other() -> None:
+    rig = Rig(width_px=40, height_px=30)
+    for channel, other in (("near", "far"), ("far", "near")):
+        depth = rig.focus_mm(channel)
+        assert plane_image(rig, channel, depth).std() > 0.25
+        assert plane_image(rig, other, depth).std() < 0.05
+    assert plane_image(rig, "near", 750.0).shape == (30, 40)
+
+
+def test_ratio_falls_from_the_near_to_the_far_plane() -> None:
+    rig = Rig()
+    depth = np.linspace(*rig.working_range_mm, 30)
+    values = ratio(rig, depth)
+    assert (np.diff(values) < 0).all()
+    assert values[0] > 0.7 and values[-1] < -0.7
+
+
+def test_projector_is_sharp_where_its_axis_meets_the_cameras() -> None:
+    """Shifted by one period the pattern repeats; the focal plane goes through (0, 0, focus)."""
+    projector = Projector(position_mm=(30.0, -80.0, 5.0), angle_deg=10.0)
+    meeting = np.array([0.0, 0.0, projector.focus_mm])
+    np.testing.assert_allclose(projector.cycles(meeting), 0, atol=1e-9)
+    right, down, forward = projector.axes
+    np.testing.assert_allclose(projector.axes @ projector.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(projector.axes) == pytest.approx(1)
+    for point in (meeting, meeting + 20 * right, meeting - 30 * down):
+        assert projector.blur_mm(point) == pytest.approx(0, abs=1e-9)
+        # Counter-clockwise as displayed, with y down.
+        turn = np.deg2rad(10.0)
+        across = np.cos(turn) * right - np.sin(turn) * down
+        np.testing.assert_allclose(
+            projector.cycles(point + projector.period_mm * across) - projector.cycles(point),
+            [1, 0],
+            atol=1e-9,
+        )
+    behind = meeting + 50 * forward
+    expected = projector.aperture_mm * 50 / (projector.focal_plane_mm + 50)
+    assert projector.blur_mm(behind) == pytest.approx(expected)
+
+
+def test_irradiance_is_one_at_the_focus_distance_and_falls_with_its_square() -> None:
+    projector = Projector(position_mm=(0.0, 0.0, 0.0))
+    facing = np.array([0.0, 0.0, -1.0])
+    assert projector.irradiance(np.array([0, 0, 750.0]), facing) == pytest.approx(1)
+    assert projector.irradiance(np.array([0, 0, 1500.0]), facing) == pytest.approx(0.25)
+    assert projector.irradiance(np.array([0, 0, 750.0]), -facing) == 0
+    oblique = np.array([750.0, 0, 750.0])  # 45°: both cosines, and √2 as far
+    assert projector.irradiance(oblique, facing) == pytest.approx(0.25)
+
+
+def test_analytic_plane_against_a_ray_traced_one() -> None:
+    """A recorded plane, with the pattern turned and its own magnification for each sensor."""
+    recording = Recording.open(SCENE.with_name("unregistered.mcap"))
+    rig = Rig.from_metadata(recording.rig)
+    frames = recording.frames(["near", "far"])
+    plane = next(f for f in frames if f.truth and f.truth.meta.get("z") == 733.0)
+    for channel in ("near", "far"):
+        projected, sky = shading(rig, channel, 733.0)
+        light = 0.78 * (plane_image(rig, channel, 733.0) * projected + sky)
+        middle = (slice(64, 192), slice(64, 192))  # the rest is vignetted
+        error = plane.images[channel][middle] / 255 - light[middle]
+        assert np.sqrt((error**2).mean()) < 0.02  # mostly noise of sensor and ray tracer
+        assert abs(error.mean()) < 0.003
