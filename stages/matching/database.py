@@ -40,7 +40,7 @@ _LEAST_SPREAD = 0.02
 parts that share a measure, the spread is noise, and noise is no unit to measure with."""
 
 _PHI_OVER_VIEWS = 2.5
-_ZETA_OVER_VIEWS = 2.0
+_ZETA_OVER_VIEWS = 1.5
 """Thresholds over the distances inside the database: views of a part lying flat, in the middle,
 free, are the best that will ever be seen of it."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 
-from stages.matching.database import Database, Part
+from stages.matching.database import Database
 from stages.matching.eigenspace import OUTLINE_STEP_DEG, Eigenspace
 from stages.matching.surfaces import Surface, grid_px, upright_view
 
@@ -27,6 +27,9 @@ F32 = NDArray[np.float32]
 _FINE_DEG = 1.0
 _FINE_PX = 2
 _FINER = 3
+"""The grid on which a misfit is measured is so much finer than the eigenspace's; odd, so that the
+one's middles are the other's."""
+
 _IN_FRONT_MM = 2.0
 """What is nearer than the surface's plane by more hides it, if it does."""
 
@@ -82,13 +85,17 @@ def name_by_what_shows(
         label: its region in ``labels`` [H W] int32, 0 = none.
         depth_m: [H W] float32, NaN where unknown.
     """
+    seen: tuple[F32, F32] | None = None
     border_mm = _BORDER_PX * 1e3 * surface.z_m / max(surface.camera.fx, surface.camera.fy)
     fits = []
     for k, part in enumerate(database.parts):
         whole, perimeter = np.median(part.features[:, :2], axis=0)
         slack = border_mm * perimeter
         if (1 - most_hidden) * whole - slack <= surface.area_mm2 <= whole + slack:
-            misfit, hidden = _fit(part, surface, label, labels, depth_m, database)
+            if seen is None:
+                side, mm_per_px = _FINER * database.side, database.mm_per_px / _FINER
+                seen = _kinds(surface, label, labels, depth_m, side, mm_per_px)
+            misfit, hidden = _fit(part.space, *seen)
             fits.append((misfit, hidden, float(slack / whole), k))
     if not fits:
         return Visible(-1, np.nan, np.inf, np.inf, np.nan)
@@ -97,22 +104,16 @@ def name_by_what_shows(
     return Visible(model, hidden, misfit, fits[1][0] if len(fits) > 1 else np.inf, allowed)
 
 
-def _fit(
-    part: Part,
-    surface: Surface,
-    label: int,
-    labels: np.ndarray,
-    depth_m: np.ndarray,
-    database: Database,
-) -> tuple[float, float]:
-    """Least misfit of a part over all turns and places, and how much of it is hidden there."""
-    side, mm_per_px = database.side, database.mm_per_px
-    region, free = _kinds(surface, label, labels, depth_m, side, mm_per_px)
-    turn, mirrored, down, right = _coarse(part.space, region - free)
-    region, free = _kinds(surface, label, labels, depth_m, _FINER * side, mm_per_px / _FINER)
+def _fit(space: Eigenspace, region: F32, free: F32) -> tuple[float, float]:
+    """Least misfit of a surface over all turns and places, and how much of it is hidden there.
+
+    ``region`` and ``free``: [N N], as :func:`_kinds` tells them on the finer grid.
+    """
+    middle = slice(_FINER // 2, None, _FINER)
+    turn, mirrored, down, right = _coarse(space, (region - free)[middle, middle])
     reach_deg = OUTLINE_STEP_DEG / 2
     turns = turn + np.arange(-reach_deg, reach_deg + _FINE_DEG / 2, _FINE_DEG)
-    masks = np.stack([part.space.outline(float(t), _FINER) for t in turns])
+    masks = np.stack([space.outline(float(t), _FINER) for t in turns])
     masks = (masks[..., ::-1] if mirrored else masks).reshape(len(turns), -1)
     areas = np.maximum(masks.sum(axis=1), 1.0)
     on_region, on_free = (

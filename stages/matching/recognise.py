@@ -161,7 +161,8 @@ def find_candidates(
         row["shape_distance"] = row["zeta"] = row["hidden_share"] = np.nan
         row["visible_model"] = -1
         _judge(row, region, surface, above, depth_m, database, rules)
-        if row["reason"] in (Reason.CUT, Reason.OCCLUDED) and rules.most_hidden > 0:
+        incomplete = row["reason"] in (Reason.CUT, Reason.OCCLUDED)
+        if incomplete and rules.most_hidden > 0 and row["tilt_deg"] <= rules.max_tilt_deg:
             shows = name_by_what_shows(
                 surface, int(row["label"]), labels, depth_m, database, rules.most_hidden
             )
