@@ -89,6 +89,11 @@ class ResultStore:
             _, dropped = self._results.popitem(last=False)
             self._bytes -= dropped.size
 
+    def clear(self) -> None:
+        """Drop everything, as when no later frame can ask for it."""
+        self._results.clear()
+        self._bytes = 0
+
 
 class Pipeline:
     """Stages in an order in which each finds what it needs.

@@ -72,11 +72,23 @@ class RecognitionScorer(Scorer):
             return []
         of = f"of {self.frames} frames"
         return [
-            Score("picked part uncovered and named rightly", self.good / self.frames, note=of),
-            Score("named rightly", self.right / self.frames, note=of),
-            Score("wrong names", float(self.wrong), "frames", note=of),
-            Score("rearrange", float(self.frames - self.picks), "frames", note=of),
+            Score(
+                "picked part uncovered and named rightly",
+                self.good / self.frames,
+                note=of,
+                better="higher",
+            ),
+            Score("named rightly", self.right / self.frames, note=of, better="higher"),
+            Score("wrong names", float(self.wrong), "frames", note=of, better="lower"),
+            Score("rearrange", float(self.frames - self.picks), "frames", note=of, better="lower"),
         ]
+
+    def state(self) -> dict[str, Any]:
+        return dict(vars(self))
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        for name, count in state.items():
+            setattr(self, name, getattr(self, name) + count)
 
 
 def truth_of_surface(
@@ -170,9 +182,19 @@ class PoseScorer(Scorer):
                 continue
             share = len(values) / max(self.poses, 1)
             note = "modulo the part's period" if key.startswith("rotation") else ""
-            scores.append(Score(f"{title}, mean error", float(np.mean(values)), unit, share, note))
-            scores.append(Score(f"{title}, worst error", float(np.max(values)), unit, share, note))
+            scores += [
+                Score(f"{title}, {which} error", float(of(values)), unit, share, note, "lower")
+                for which, of in (("mean", np.mean), ("worst", np.max))
+            ]
         return scores
+
+    def state(self) -> dict[str, Any]:
+        return {"poses": self.poses, "errors": self.errors}
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        self.poses += state["poses"]
+        for key, values in state["errors"].items():
+            self.errors.setdefault(key, []).extend(values)
 
 
 def rotation_error_deg(

@@ -1,0 +1,211 @@
+"""``workbench sweep``: a grid of parameters over recordings, to tables and a gallery."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from typing import Any
+
+import typer
+
+from workbench.console import err, out, progress_to, table
+from workbench.errors import EXIT_FAILED
+from workbench.report import finite, to_json
+from workbench.sweep import run as sweeping
+from workbench.sweep.analysis import Choice, main_effects
+from workbench.sweep.run import BEST, CELLS_TABLE, FRAMES_TABLE, Request, Sweep
+from workbench.sweep.table import Metric
+
+_SHOWN_CELLS = 8
+_SHOWN_METRICS = 40
+
+
+def run(request: Request, as_json: bool) -> None:
+    """Sweep, and say what it says; exits with 1 if every cell failed."""
+    try:
+        with progress_to("sweep") as advance:
+            sweep = sweeping.run(request, advance)
+    except KeyboardInterrupt:
+        err.print("interrupted; what was done is kept, and the same command goes on from there")
+        raise
+    if as_json:
+        print(to_json(as_dict(sweep)))
+    else:
+        _tell(sweep)
+    if all(row.failed_frames for row in sweep.rows):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def replay_line(sweep: Sweep, configuration: Any, frame: str = "") -> str:
+    """The command that shows a cell's full stack of pictures, to be copied from the terminal."""
+    request = sweep.request
+    options = request.options
+    parts = ["workbench", "replay", str(request.recordings[0]), "--config", str(configuration)]
+    for name, path in options.resources.items():
+        parts += [f"--{name}", str(path)]
+    for channel, topic in options.topics.items():
+        parts += ["--topic", f"{channel}={topic}"]
+    for plugin in options.plugins:
+        parts += ["--plugin", str(plugin)]
+    if options.until is not None:
+        parts += ["--until", options.until]
+    if frame:
+        parts += ["--frames", frame]
+    return shlex.join(parts)
+
+
+def as_dict(sweep: Sweep) -> dict[str, Any]:
+    """All that the command says, as JSON values."""
+    folder = sweep.request.folder
+    return {
+        "to": str(folder),
+        "tables": {"cells": CELLS_TABLE, "frames": FRAMES_TABLE},
+        "cells": len(sweep.rows),
+        "of": sweep.grid.size,
+        "axes": {axis.address: list(axis.values) for axis in sweep.grid.axes},
+        "failed_cells": [row.cell.index for row in sweep.rows if row.failed_frames],
+        "errors": sorted({row.error for row in sweep.rows if row.error}),
+        "metrics": {
+            m.address: finite({"title": m.title, "unit": m.unit, "better": m.better})
+            for m in sweep.metrics
+        },
+        "best": [_choice_dict(sweep, choice) for choice in sweep.choices],
+        "spent": {
+            "computed": sweep.spent.computed,
+            "kept": sweep.spent.kept,
+            "seconds": round(sweep.spent.total, 3),
+            "worker_seconds": round(sweep.spent.workers, 3),
+            "stage_seconds": round(sweep.spent.stages, 3),
+        },
+        "provenance": sweep.provenance,
+    }
+
+
+def _choice_dict(sweep: Sweep, choice: Choice) -> dict[str, Any]:
+    flat = choice.flat
+    return {
+        "metric": choice.metric.address,
+        "better": choice.metric.better,
+        "cell": choice.row.cell.index,
+        "values": dict(choice.row.cell.values),
+        "value": choice.row.figures[choice.metric.address],
+        "equals": choice.equals,
+        "configuration": str(sweep.request.folder / BEST) if choice is sweep.choices[0] else None,
+        "flat": {
+            "cells": list(flat.cells),
+            "within": flat.within,
+            "spans": {axis: list(span) for axis, span in flat.spans.items()},
+        },
+        "main_effects": main_effects(sweep.grid, sweep.rows, choice.metric),
+    }
+
+
+def _tell(sweep: Sweep) -> None:
+    request, spent = sweep.request, sweep.spent
+    sampled = "" if sweep.grid.sampled is None else f", a sample of {sweep.grid.size:,}"
+    frames = sum(len(own) for own in sweep.frames)
+    out.print(
+        f"[bold]{len(sweep.rows):,} cells[/bold]{sampled}, {frames} frames; "
+        f"{spent.computed:,} cells of a frame computed, {spent.kept:,} kept from before"
+    )
+    if sweep.choices:
+        for choice in sweep.choices:
+            _tell_choice(sweep, choice)
+    else:
+        _tell_metrics(sweep)
+    failed = [row for row in sweep.rows if row.failed_frames]
+    for says in sorted({row.error for row in failed}):
+        count = sum(row.error == says for row in failed)
+        out.print(f"FAILED, {count} cells: {says}", style="bold red", markup=False)
+    names = [CELLS_TABLE, FRAMES_TABLE, *([BEST] if sweep.choices else [])]
+    out.print(f"wrote {', '.join(names)} to {request.folder}", soft_wrap=True, markup=False)
+    if sweep.choices:
+        line = replay_line(sweep, request.folder / BEST)
+        out.print(f"see the best cell: {line}", soft_wrap=True, markup=False)
+
+
+def _tell_choice(sweep: Sweep, choice: Choice) -> None:
+    metric = choice.metric
+    ranked = sorted(
+        (row for row in sweep.rows if math.isfinite(row.figures.get(metric.address, math.nan))),
+        key=lambda row: (
+            row is not choice.row,
+            bool(row.failed_frames),
+            -metric.worth(row.figures[metric.address]),
+            row.cell.index,
+        ),
+    )
+    shown = ranked[:_SHOWN_CELLS]
+    if len(ranked) > _SHOWN_CELLS:
+        shown = [*ranked[: _SHOWN_CELLS - 1], ranked[-1]]
+    axes = [axis.address for axis in sweep.grid.axes]
+    table(
+        f"{metric.address} ({_way(metric)}), the best cells and the worst",
+        ("cell #", f"{metric.address} value", *axes),
+        (
+            (
+                row.cell.index,
+                _number(row.figures[metric.address], metric),
+                *(row.cell.values[address] for address in axes),
+            )
+            for row in shown
+        ),
+    )
+    flat = choice.flat
+    if choice.equals:
+        out.print(f"{choice.equals} other cells have the same value; this one has the best around")
+    spans = "; ".join(
+        f"{address} {first}" if first == last else f"{address} {first} .. {last}"
+        for address, (first, last) in flat.spans.items()
+    )
+    out.print(
+        f"flat region: {len(flat.cells)} of {len(sweep.rows)} cells around the best are within "
+        f"{_number(flat.within, metric)}: {spans}",
+        soft_wrap=True,
+        markup=False,
+    )
+    effects = main_effects(sweep.grid, sweep.rows, metric)
+    if effects:
+        shares = ", ".join(
+            f"{name} {100 * share:.0f} %"
+            for name, share in sorted(effects.items(), key=lambda item: -item[1])
+        )
+        rest = max(0.0, 1 - math.fsum(effects.values()))
+        out.print(
+            f"what matters: {shares}, together {100 * rest:.0f} %", soft_wrap=True, markup=False
+        )
+    else:
+        out.print("no axis matters: every cell has the same value")
+
+
+def _tell_metrics(sweep: Sweep) -> None:
+    """Every figure with its spread over the cells, for who has not chosen one."""
+    rows = []
+    for metric in sweep.metrics:
+        values = [row.figures.get(metric.address, math.nan) for row in sweep.rows]
+        values = [value for value in values if math.isfinite(value)]
+        if values and min(values) < max(values):
+            effects = main_effects(sweep.grid, sweep.rows, metric)
+            most = max(effects, key=lambda name: effects[name], default="")
+            says = f"{most} {100 * effects[most]:.0f} %" if most else ""
+            low, high = (_number(value, metric) for value in (min(values), max(values)))
+            rows.append((metric.address, low, high, _way(metric), says))
+    table(
+        "Figures that differ among the cells; choose by one with --metric",
+        ("figure", "least value", "greatest value", "better", "what matters most"),
+        rows[:_SHOWN_METRICS],
+    )
+
+
+def _way(metric: Metric) -> str:
+    return (
+        {"higher": "higher is better", "lower": "lower is better", "zero": "nearer 0 is better"}[
+            metric.better
+        ]
+        if metric.better
+        else "neither"
+    )
+
+
+def _number(value: float, metric: Metric) -> str:
+    return f"{value:.4g} {metric.unit}".strip()
