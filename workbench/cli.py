@@ -327,9 +327,21 @@ def sweep(
             metavar="DIR",
         ),
     ] = None,
-    pictures: Annotated[
-        int, typer.Option(help="Frames of which each cell keeps a picture; 0 for no gallery.")
-    ] = 4,
+    pictures: Annotated[int, typer.Option(help="Frames of which each cell keeps a picture.")] = 4,
+    view: Annotated[
+        bool | None,
+        typer.Option("--view/--no-view", help="Open the gallery; if not given, on a display."),
+    ] = None,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(
+            help="Take a picture (PNG) of the gallery, and NAME-grid.png of the heat maps; needs "
+            "no screen."
+        ),
+    ] = None,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1920x1080",
     calibration: Calibration = None,
     models: Models = None,
     preset: Preset = None,
@@ -370,7 +382,7 @@ def sweep(
         scheduler,
         pictures,
     )
-    command.run(request, as_json)
+    command.run(request, view, screenshot, window, as_json)
 
 
 def main() -> None:

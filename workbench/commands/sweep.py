@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 import shlex
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import typer
 
+from workbench.commands.replay import window_size
 from workbench.console import err, out, progress_to, table
 from workbench.errors import EXIT_FAILED
+from workbench.files import check_output
 from workbench.report import finite, to_json
 from workbench.sweep import run as sweeping
 from workbench.sweep.analysis import Choice, main_effects
+from workbench.sweep.cache import Cache
 from workbench.sweep.run import BEST, CELLS_TABLE, FRAMES_TABLE, Request, Sweep
 from workbench.sweep.table import Metric
 
@@ -20,27 +26,78 @@ _SHOWN_CELLS = 8
 _SHOWN_METRICS = 40
 
 
-def run(request: Request, as_json: bool) -> None:
-    """Sweep, and say what it says; exits with 1 if every cell failed."""
+def run(
+    request: Request, view: bool | None, screenshot: Path | None, window: str, as_json: bool
+) -> None:
+    """Sweep, say what it says and show it; exits with 1 if every cell failed."""
+    size = window_size(window)
+    if screenshot is not None:
+        check_output("--screenshot", screenshot)
+    cards = 0
+
+    def draw(sweep: Sweep, cache: Cache) -> None:
+        # Rerun is imported only now, when the work is done: workers never need it.
+        from workbench.sweep import gallery
+
+        nonlocal cards
+        cards = gallery.write(sweep, cache, partial(replay_line, sweep))
+
     try:
         with progress_to("sweep") as advance:
-            sweep = sweeping.run(request, advance)
+            sweep = sweeping.run(request, advance, draw)
     except KeyboardInterrupt:
         err.print("interrupted; what was done is kept, and the same command goes on from there")
         raise
     if as_json:
         print(to_json(as_dict(sweep)))
     else:
-        _tell(sweep)
+        _tell(sweep, cards)
+    _show(sweep, view, screenshot, size, as_json)
     if all(row.failed_frames for row in sweep.rows):
         raise typer.Exit(EXIT_FAILED)
 
 
-def replay_line(sweep: Sweep, configuration: Any, frame: str = "") -> str:
+def _show(
+    sweep: Sweep,
+    view: bool | None,
+    screenshot: Path | None,
+    size: tuple[int, int],
+    as_json: bool,
+) -> None:
+    """Open the gallery where there is a display or one is asked for, and take its picture."""
+    from workbench.sweep.gallery import OVERVIEW, served
+    from workbench.viewer import has_display, how_to_open, show, take_screenshot
+
+    folder = sweep.request.folder
+    overview = folder / OVERVIEW
+    wanted = view or (view is None and has_display() and screenshot is None and not as_json)
+    if wanted and not has_display():
+        err.print("no display: the gallery cannot be opened here", soft_wrap=True)
+        wanted = False
+    if screenshot is not None:
+        grid = screenshot.with_name(f"{screenshot.stem}-grid{screenshot.suffix}")
+        with served(folder) as address:
+            take_screenshot(address, screenshot, size)
+        take_screenshot(overview, grid, size)
+        if not as_json:
+            out.print(f"wrote {screenshot} and {grid}", soft_wrap=True, markup=False)
+    if wanted:
+        with served(folder) as address, suppress(KeyboardInterrupt):
+            child = show([str(overview), address])
+            err.print("the gallery is served until the viewer is closed, or Ctrl-C", style="dim")
+            child.wait()
+    elif not as_json:
+        says = f"open the heat maps: {how_to_open(overview)}"
+        out.print(says, soft_wrap=True, markup=False)
+        out.print("open the gallery: the same command with --view, where there is a display")
+
+
+def replay_line(sweep: Sweep, configuration: Path, frames: str = "", recording: int = 0) -> str:
     """The command that shows a cell's full stack of pictures, to be copied from the terminal."""
     request = sweep.request
     options = request.options
-    parts = ["workbench", "replay", str(request.recordings[0]), "--config", str(configuration)]
+    parts = ["workbench", "replay", str(request.recordings[recording])]
+    parts += ["--config", str(configuration)]
     for name, path in options.resources.items():
         parts += [f"--{name}", str(path)]
     for channel, topic in options.topics.items():
@@ -49,8 +106,8 @@ def replay_line(sweep: Sweep, configuration: Any, frame: str = "") -> str:
         parts += ["--plugin", str(plugin)]
     if options.until is not None:
         parts += ["--until", options.until]
-    if frame:
-        parts += ["--frames", frame]
+    if frames:
+        parts += ["--frames", frames]
     return shlex.join(parts)
 
 
@@ -100,7 +157,7 @@ def _choice_dict(sweep: Sweep, choice: Choice) -> dict[str, Any]:
     }
 
 
-def _tell(sweep: Sweep) -> None:
+def _tell(sweep: Sweep, cards: int) -> None:
     request, spent = sweep.request, sweep.spent
     sampled = "" if sweep.grid.sampled is None else f", a sample of {sweep.grid.size:,}"
     frames = sum(len(own) for own in sweep.frames)
@@ -117,8 +174,10 @@ def _tell(sweep: Sweep) -> None:
     for says in sorted({row.error for row in failed}):
         count = sum(row.error == says for row in failed)
         out.print(f"FAILED, {count} cells: {says}", style="bold red", markup=False)
-    names = [CELLS_TABLE, FRAMES_TABLE, *([BEST] if sweep.choices else [])]
-    out.print(f"wrote {', '.join(names)} to {request.folder}", soft_wrap=True, markup=False)
+    names = [CELLS_TABLE, FRAMES_TABLE, *([BEST] if sweep.choices else []), "sweep.rrd"]
+    best = "" if cards == len(sweep.rows) else "the best "
+    says = f"wrote {', '.join(names)} and a gallery of {best}{cards} cells to {request.folder}"
+    out.print(says, soft_wrap=True, markup=False)
     if sweep.choices:
         line = replay_line(sweep, request.folder / BEST)
         out.print(f"see the best cell: {line}", soft_wrap=True, markup=False)
@@ -172,7 +231,9 @@ def _tell_choice(sweep: Sweep, choice: Choice) -> None:
         )
         rest = max(0.0, 1 - math.fsum(effects.values()))
         out.print(
-            f"what matters: {shares}, together {100 * rest:.0f} %", soft_wrap=True, markup=False
+            f"what matters: {shares}; their interplay {100 * rest:.0f} %",
+            soft_wrap=True,
+            markup=False,
         )
     else:
         out.print("no axis matters: every cell has the same value")

@@ -86,8 +86,10 @@ class Sweep:
     job: Job
     configurations: dict[int, Path]
     """Cell to the file that ``replay --config`` reads."""
-    chosen_stages: list[Stage]
+    stages: list[Stage]
     keys: list[dict[int, dict[str, str]]] = field(repr=False)
+    spans: list[tuple[int, int]]
+    """Of each recording, the first frame asked for and the one after the last."""
     frames: list[list[int]] = field(repr=False)
     """Of each recording, the frames that were read."""
     spent: Spent = field(default_factory=Spent)
@@ -431,6 +433,7 @@ def _finished(
         configurations,
         list(pipeline.stages),
         keys,
+        list(spans),
         frames,
         spent,
     )
