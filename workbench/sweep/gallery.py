@@ -492,19 +492,19 @@ def _log_charts(stream: rr.RecordingStream, sweep: Sweep, choice: Choice) -> Any
     effects = main_effects(sweep.grid, sweep.rows, metric)
     root = f"charts/{_path(metric.address)}"
     place = choice.row.cell.place
-    maps = []
+    swept = [n for n in range(len(steps)) if len(steps[n][0].values) > 1]
     # The axes that matter most come first: a grid of many axes has more pairs than fit.
-    ranked = sorted(range(len(steps)), key=lambda n: -effects.get(_name(steps[n]), 0.0))
-    pairs = [
-        pair for pair in combinations(ranked, 2) if all(len(steps[n][0].values) > 1 for n in pair)
-    ]
-    for first, second in pairs[:_SHOWN_PAIRS]:
-        x, y = sorted((first, second), key=lambda n: -len(steps[n][0].values))
+    ranked = sorted(swept, key=lambda n: -effects.get(_name(steps[n]), 0.0))
+    pairs = [sorted(pair) for pair in combinations(ranked, 2)][:_SHOWN_PAIRS]
+    labelled = _MOST_LABELLED if len(pairs) == 1 else _MOST_LABELLED // 2
+    maps = []
+    for pair in pairs:
+        # The longer axis lies along the wider side.
+        x, y = sorted(pair, key=lambda n: -len(steps[n][0].values))
         values = surface(sweep.rows, metric, (x, y))
-        labelled = _MOST_LABELLED if len(pairs) == 1 else _MOST_LABELLED // 2
         chosen = (place[x], place[y])
         chart = heat_chart(steps[x][0], steps[y][0], values, chosen, metric, labelled)
-        path = f"{root}/map_{x}_{y}"
+        path = f"{root}/map_{pair[0]}_{pair[1]}"
         chart.log(stream, path)
         maps.append(_chart_view(path, chart, f"{_short(sweep, y)} over {_short(sweep, x)}"))
     curves = []
