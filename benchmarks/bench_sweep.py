@@ -127,3 +127,7 @@ def report(frames: tuple[int, int], folder: Path) -> None:
     console = Console(width=120)
     console.print(table)
     console.print(f"load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+if __name__ == "__main__":
+    main()

@@ -191,7 +191,7 @@ class Pipeline:
                 self.store.put(key, result)
                 computed.add(stage.name)
             artifacts.update(result.outputs)
-            digests.update((a.name, digest_of([key, a.name])) for a in stage.gives)
+            digests.update((a.name, f"{key} {a.name}") for a in stage.gives)
             warnings += [f"{stage.name}: {says}" for says in result.warnings]
             stage_ms[stage.name] = result.milliseconds
         return Run(

@@ -31,7 +31,6 @@ from workbench.sweep.analysis import Choice, curve, main_effects, surface
 from workbench.sweep.axes import Axis
 from workbench.sweep.cache import Cache
 from workbench.sweep.charts import Chart, heat_chart, line_chart
-from workbench.sweep.results import Reader
 from workbench.sweep.run import Sweep
 from workbench.sweep.table import Metric, Row
 from workbench.viewer import LOOPBACK
@@ -81,24 +80,22 @@ def write(sweep: Sweep, cache: Cache, command: Command) -> int:
     folder = sweep.request.folder / GALLERY
     folder.mkdir(parents=True, exist_ok=True)
     rows = _rows_shown(sweep)
-    reader = Reader(
-        sweep.job, sweep.spans, sweep.keys, cache, frozenset(m.address for m in _metrics(sweep))
-    )
     before = _read_index(folder / INDEX)
     index: dict[str, str] = {}
-    shown = [_shown(sweep, row, reader, cache, command) for row in rows]
+    telling = _telling(sweep)
+    shown = [_shown(sweep, row, cache, command) for row in rows]
     for one in shown:
         path = folder / f"{sweep.configurations[one.row.cell.index].stem}.rrd"
-        index[path.name] = _identity(sweep, one)
+        index[path.name] = _identity(sweep, one, telling)
         if before.get(path.name) != index[path.name] or not path.is_file():
-            _write_cell(path, sweep, one, command)
+            _write_cell(path, sweep, one, command, telling)
     for stale in set(folder.glob("*.rrd")) - {folder / name for name in index}:
         stale.unlink()
     whole = digest_of([*sorted(index.items()), _overview_identity(sweep)])
     overview = sweep.request.folder / OVERVIEW
     if before.get(OVERVIEW) != whole or not overview.is_file():
         _write_overview(overview, sweep, shown)
-        _save_layouts(folder, sweep)
+        _save_layouts(folder, sweep, telling)
     index[OVERVIEW] = whole
     with replacing(folder / INDEX) as beside:
         beside.write_text(json.dumps(index, indent=1, sort_keys=True), encoding="utf-8")
@@ -128,6 +125,17 @@ def _metrics(sweep: Sweep) -> list[Metric]:
     return [choice.metric for choice in sweep.choices]
 
 
+def _telling(sweep: Sweep) -> list[Metric]:
+    """The chosen figures, and those that differ among the cells: by others nobody sorts."""
+    chosen = {metric.address for metric in _metrics(sweep)}
+    found = []
+    for metric in sweep.metrics:
+        values = {row.figures.get(metric.address) for row in sweep.rows}
+        if metric.address in chosen or len(values) > 1:
+            found.append(metric)
+    return found
+
+
 def _rows_shown(sweep: Sweep) -> list[Row]:
     rows = [row for row in sweep.rows if row.cell.index in sweep.configurations]
     if len(rows) > MOST_CARDS and sweep.choices:
@@ -136,7 +144,7 @@ def _rows_shown(sweep: Sweep) -> list[Row]:
     return sorted(rows[:MOST_CARDS], key=lambda row: row.cell.index)
 
 
-def _shown(sweep: Sweep, row: Row, reader: Reader, cache: Cache, command: Command) -> _Shown:
+def _shown(sweep: Sweep, row: Row, cache: Cache, command: Command) -> _Shown:
     pictures = []
     stage = sweep.job.picture_stage
     if stage is not None:
@@ -152,20 +160,21 @@ def _shown(sweep: Sweep, row: Row, reader: Reader, cache: Cache, command: Comman
         owner = next(s for s in sweep.stages if s.name == address.partition(".")[0])
         series = [
             (one.recording, one.frame, one.figures[address])
-            for one in reader.result(row.cell, owner).frames.values()
+            for one in sweep.reader.result(row.cell, owner).frames.values()
             if address in one.figures
         ]
     line = command(sweep.configurations[row.cell.index])
     return _Shown(row, line, tuple(pictures), tuple(series))
 
 
-def _identity(sweep: Sweep, one: _Shown) -> str:
+def _identity(sweep: Sweep, one: _Shown, telling: Sequence[Metric]) -> str:
     return digest_of(
         [
             _FORMAT,
             one.row.digest,
             one.command,
             repr(sorted(one.row.figures.items())),
+            repr([metric.address for metric in telling]),
             repr([(metric.address, metric.better) for metric in _metrics(sweep)]),
             repr([(r, f, digest_of([image])) for r, f, image in one.pictures]),
             repr(one.series),
@@ -211,13 +220,17 @@ def _recording(path: Path, recording_id: str, name: str) -> Iterator[rr.Recordin
 # -- a cell ---------------------------------------------------------------------------------------
 
 
-def _write_cell(path: Path, sweep: Sweep, one: _Shown, command: Command) -> None:
+def _write_cell(
+    path: Path, sweep: Sweep, one: _Shown, command: Command, telling: Sequence[Metric]
+) -> None:
     row = one.row
     best = bool(sweep.choices) and row is sweep.choices[0].row
     name = f"cell {row.cell.index}" + (", the best" if best else "")
     with _recording(path, f"cell-{path.stem}", name) as stream:
         stream.send_property("axes", rr.AnyValues(**_property_names(row.cell.values)))
-        stream.send_property("scores", rr.AnyValues(**_property_names(_finite(row.figures))))
+        scores = _finite({m.address: row.figures.get(m.address, math.nan) for m in telling})
+        if scores:
+            stream.send_property("scores", rr.AnyValues(**_property_names(scores)))
         stream.send_property(
             "run",
             rr.AnyValues(
@@ -293,7 +306,7 @@ def _finite(values: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-def _save_layouts(folder: Path, sweep: Sweep) -> None:
+def _save_layouts(folder: Path, sweep: Sweep, telling: Sequence[Metric]) -> None:
     """How the table of cells looks, and how a cell looks when its card is opened."""
     picture = rrb.Spatial2DView(origin="picture", name="picture")
     plot = rrb.TimeSeriesView(
@@ -311,7 +324,7 @@ def _save_layouts(folder: Path, sweep: Sweep) -> None:
     opening = Column("property:run:open", name="all its pictures")
     rest = [
         Column(_column("scores", metric.address), name=metric.address)
-        for metric in sweep.metrics
+        for metric in telling
         if metric.address not in {choice.metric.address for choice in sweep.choices}
     ]
     hidden = [

@@ -7,6 +7,7 @@ parameters differ only downstream of a stage have one key there, and so one resu
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,7 +84,7 @@ def result_keys(pipeline: Pipeline, settings: Settings) -> dict[str, str]:
     """Each stage's key under these settings."""
     givers = {artifact.name: stage.name for stage in pipeline.stages for artifact in stage.gives}
     code = pipeline.code_digests()
-    libraries = repr(sorted(library_versions().items()))
+    libraries = _libraries()
     keys: dict[str, str] = {}
     for stage in pipeline.stages:
         parts = [RECORD_FORMAT, libraries, stage.name, code[stage.name]]
@@ -97,6 +98,11 @@ def result_keys(pipeline: Pipeline, settings: Settings) -> dict[str, str]:
                 parts.append(need.name)
         keys[stage.name] = digest_of(parts)
     return keys
+
+
+@functools.cache
+def _libraries() -> str:
+    return repr(sorted(library_versions().items()))
 
 
 def upstream(stages: Sequence[Stage]) -> dict[str, set[str]]:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import tomli_w
+
 from workbench import interrupts
 from workbench.digest import digest_of
 from workbench.errors import DataError, UsageError
@@ -88,8 +90,7 @@ class Sweep:
     """Cell to the file that ``replay --config`` reads."""
     stages: list[Stage]
     keys: list[dict[int, dict[str, str]]] = field(repr=False)
-    spans: list[tuple[int, int]]
-    """Of each recording, the first frame asked for and the one after the last."""
+    reader: Reader = field(repr=False)
     frames: list[list[int]] = field(repr=False)
     """Of each recording, the frames that were read."""
     spent: Spent = field(default_factory=Spent)
@@ -433,7 +434,7 @@ def _finished(
         configurations,
         list(pipeline.stages),
         keys,
-        list(spans),
+        reader,
         frames,
         spent,
     )
@@ -510,20 +511,22 @@ def _configurations(
             shown.sort(key=lambda row: -metric.worth(row.figures.get(metric.address, math.nan)))
         shown = sorted(shown[:MOST_CONFIGURATIONS], key=lambda row: row.cell.index)
     digits = max(4, len(str(max(row.cell.index for row in rows))))
+    # The same for all: written once, for it is most of each file.
     brief = {key: provenance[key] for key in ("bench", "code", "recordings")}
+    about = "\n" + tomli_w.dumps({"provenance": brief})
     found: dict[int, Path] = {}
     for row in shown:
         settings = adjusted(stages, session.pipeline.settings, row.cell.values)
         path = folder / f"{row.cell.index:0{digits}d}.toml"
         found[row.cell.index] = path
-        _write_if_other(path, to_toml(settings, _reason(row, choices), brief))
+        _write_if_other(path, to_toml(settings, _reason(row, choices)) + about)
     stale = set(folder.glob("*.toml")) - set(found.values())
     for path in stale:
         path.unlink()
     if choices:
         best = choices[0].row
         settings = adjusted(stages, session.pipeline.settings, best.cell.values)
-        _write_if_other(request.folder / BEST, to_toml(settings, _reason(best, choices), brief))
+        _write_if_other(request.folder / BEST, to_toml(settings, _reason(best, choices)) + about)
     else:
         (request.folder / BEST).unlink(missing_ok=True)
     return found

@@ -6,6 +6,7 @@ columns are the same whatever the number of workers and whatever was kept from b
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
@@ -69,6 +70,7 @@ class Row:
     ms: Mapping[str, float] = field(default_factory=dict)
 
 
+@functools.lru_cache(maxsize=4096)
 def slug(name: str) -> str:
     """A figure's name as part of an address: ``faces found (IoU ≥ 0.7)`` is ``faces_found``."""
     bare = re.sub(r"\([^)]*\)", "", name.replace("×", "x").replace("%", "percent"))

@@ -20,7 +20,7 @@ from workbench.errors import DataError, one_line
 from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.plugins import find_stages
 from workbench.session import Session
-from workbench.settings import adjusted
+from workbench.settings import Settings, adjusted
 from workbench.stage import Stage
 from workbench.sweep.cache import Kept, packed
 from workbench.sweep.pictures import drawn, outline_of
@@ -28,6 +28,7 @@ from workbench.sweep.plan import Job, Task, result_keys, upstream
 
 _STORE_BYTES = 512 << 20
 _OPEN_SESSIONS = 2
+_HELD_CELLS = 1024
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,9 @@ class _Opened:
     stages: Mapping[str, Stage]
     visible: Mapping[str, frozenset[str]]
     """To each stage's scorer and figures: the artifacts that do not depend on later stages."""
+    base: Settings
+    cells: dict[str, tuple[Pipeline, dict[str, str]]]
+    """Pipelines and keys of cells, by their values: the next block of frames has the same."""
 
 
 def _open(job: Job, recording: int) -> _Opened:
@@ -108,7 +112,9 @@ def _open(job: Job, recording: int) -> _Opened:
         )
         for name, names in before.items()
     }
-    _opened[where] = _Opened(session, find_stages(job.options.plugins), visible)
+    found = find_stages(job.options.plugins)
+    base = adjusted(found, session.pipeline.settings, job.base)
+    _opened[where] = _Opened(session, found, visible, base, {})
     while len(_opened) > _OPEN_SESSIONS:
         _opened.popitem(last=False)
     return _opened[where]
@@ -116,12 +122,7 @@ def _open(job: Job, recording: int) -> _Opened:
 
 def _work(opened: _Opened, job: Job, task: Task, start: float) -> Outcome:
     session = opened.session
-    base = adjusted(opened.stages, session.pipeline.settings, job.base)
-    pipelines: list[tuple[Pipeline, dict[str, str]]] = []
-    for values in task.cells:
-        settings = adjusted(opened.stages, base, values)
-        pipeline = session.pipeline.with_settings(settings)
-        pipelines.append((pipeline, result_keys(pipeline, settings)))
+    pipelines = [_pipeline(opened, values) for values in task.cells]
     seen = dict.fromkeys(range(task.start, task.stop), False)
     kept: list[Kept] = []
     stage_seconds = 0.0
@@ -143,6 +144,18 @@ def _work(opened: _Opened, job: Job, task: Task, start: float) -> Outcome:
         session.pipeline.store.clear()
     seconds = time.perf_counter() - start
     return Outcome(task.number, seen, tuple(kept), seconds, stage_seconds)
+
+
+def _pipeline(opened: _Opened, values: Mapping[str, Any]) -> tuple[Pipeline, dict[str, str]]:
+    """The pipeline with a cell's values, and the keys of its results."""
+    where = repr(sorted(values.items()))
+    if where not in opened.cells:
+        if len(opened.cells) >= _HELD_CELLS:
+            opened.cells.clear()
+        settings = adjusted(opened.stages, opened.base, values)
+        pipeline = opened.session.pipeline.with_settings(settings)
+        opened.cells[where] = pipeline, result_keys(pipeline, settings)
+    return opened.cells[where]
 
 
 def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> Kept:
