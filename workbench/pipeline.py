@@ -121,13 +121,19 @@ class Pipeline:
             if path is not None and need.load is not None:
                 self.resources[need.name] = _load(need, path)
         self._code = {s.name: digest_of_code(type(s).__module__) for s in self.stages}
+        self._texts = self._parameter_texts()
         self._warm: set[str] = set()
+        self._taken: list[tuple[Frame, dict[str, Any], dict[str, str]]] = []
 
     def with_settings(self, settings: Settings) -> Pipeline:
         """The same stages and resources under other parameters, with results kept in common."""
         other = copy.copy(self)
         other.settings = settings
+        other._texts = other._parameter_texts()
         return other
+
+    def _parameter_texts(self) -> dict[str, str]:
+        return {s.name: self.settings.parameters[s.name].model_dump_json() for s in self.stages}
 
     def sources(self, kind: type[S]) -> list[S]:
         """The needs of one kind that no stage gives, without doubles; required where any is."""
@@ -158,9 +164,7 @@ class Pipeline:
 
     def run(self, frame: Frame) -> Run:
         """The frame through all stages.  A stage's exception never hides the others' results."""
-        artifacts: dict[str, Any] = {}
-        digests: dict[str, str] = {}
-        self._take_sources(frame, artifacts, digests)
+        artifacts, digests = self._sources_of(frame)
         failures: list[Failure] = []
         failed_givers: dict[str, str] = {}
         warnings: list[str] = []
@@ -176,7 +180,7 @@ class Pipeline:
                 continue
             parameters = self.settings.parameters[stage.name]
             key = digest_of(
-                [stage.name, self._code[stage.name], parameters.model_dump_json()]
+                [stage.name, self._code[stage.name], self._texts[stage.name]]
                 + [f"{n.name} {digests.get(n.name)}" for n in stage.needs]
             )
             result = self.store.get(key)
@@ -203,6 +207,17 @@ class Pipeline:
             MappingProxyType(stage_ms),
             frozenset(computed),
         )
+
+    def _sources_of(self, frame: Frame) -> tuple[dict[str, Any], dict[str, str]]:
+        """What no stage gives, and its digests; of the latest frame they are remembered."""
+        if not (self._taken and self._taken[0][0] is frame):
+            artifacts: dict[str, Any] = {}
+            digests: dict[str, str] = {}
+            self._take_sources(frame, artifacts, digests)
+            # In place: pipelines with other settings share it.
+            self._taken[:] = [(frame, artifacts, digests)]
+        _, artifacts, digests = self._taken[0]
+        return dict(artifacts), dict(digests)
 
     def _take_sources(
         self, frame: Frame, artifacts: dict[str, Any], digests: dict[str, str]
@@ -310,7 +325,7 @@ def dependencies(stages: Iterable[Stage]) -> list[tuple[str, str, str]]:
 
 def _bytes_of(value: Any, seen: set[int]) -> int:
     """Bytes of the arrays that a value holds, through dataclasses and containers, each once."""
-    if id(value) in seen:
+    if isinstance(value, float | int | str) or id(value) in seen:
         return 0
     seen.add(id(value))
     if isinstance(value, np.ndarray):

@@ -6,7 +6,6 @@ file, and each ``--set``.  What differs from the preset is remembered, for the p
 
 from __future__ import annotations
 
-import functools
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -118,7 +117,7 @@ def _compared(
     """Settings that remember where these parameters differ from the preset."""
     changed: dict[str, Any] = {}
     for name, stage in stages.items():
-        unchanged = _of_preset(type(stage), preset)
+        unchanged = _of_preset(stage, preset)
         for key in type(unchanged).model_fields:
             value = getattr(parameters[name], key)
             if value != getattr(unchanged, key):
@@ -126,10 +125,15 @@ def _compared(
     return Settings(preset, parameters, changed)
 
 
-@functools.cache
-def _of_preset(stage: Any, preset: str) -> StageParameters:
-    """The parameters that a class of stages has under a preset alone."""
-    return _validate(stage, stage.presets.get(preset, {}))
+_presets: dict[tuple[type[Stage], str], StageParameters] = {}
+
+
+def _of_preset(stage: Stage, preset: str) -> StageParameters:
+    """The parameters that a stage has under a preset alone, checked once for each class."""
+    where = (type(stage), preset)
+    if where not in _presets:
+        _presets[where] = _validate(stage, stage.presets.get(preset, {}))
+    return _presets[where]
 
 
 def to_toml(

@@ -23,6 +23,9 @@ from workbench.errors import DataError
 
 _APPLICATION = 0x5357_4550  # "SWEP", so that another program's file is not taken for ours.
 _ARRAY = "__array__"
+# Made once, for that costs more than what they do; a process packs in one thread at a time.
+_compressor = zstandard.ZstdCompressor(level=3)
+_decompressor = zstandard.ZstdDecompressor()
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS results (
     source TEXT, frame INTEGER, key TEXT, failed INTEGER, record BLOB, outline BLOB,
@@ -53,12 +56,12 @@ class Kept:
 def packed(value: Any) -> bytes:
     """Numbers, texts, lists, mappings and numpy arrays as bytes, which nothing executes to read."""
     text = json.dumps(value, default=_array_to_json, separators=(",", ":"))
-    return zstandard.ZstdCompressor(level=3).compress(text.encode())
+    return _compressor.compress(text.encode())
 
 
 def unpacked(data: bytes) -> Any:
     """The value that was :func:`packed`."""
-    text = zstandard.ZstdDecompressor().decompress(data)
+    text = _decompressor.decompress(data)
     return json.loads(text, object_hook=_array_from_json)
 
 
