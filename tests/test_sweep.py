@@ -186,18 +186,25 @@ def test_the_tables_are_the_same_for_any_number_of_workers(
     assert Path("of1/best.toml").read_text() == Path("of2/best.toml").read_text()
 
 
-def test_the_tables_of_a_cluster_are_the_same(bench: Command, scene: Path, tiny: Path) -> None:
+def test_the_tables_of_a_cluster_are_the_same_though_a_worker_dies(
+    bench: Command, scene: Path, tiny: Path
+) -> None:
     distributed = pytest.importorskip("distributed")
-    swept(bench, scene, tiny, *GRID, "--workers", 1, to="here")
+    axes = (*GRID, "--axis", "darkest.mood=well,die")
+    marker = tiny.parent / "marker"
+    marker.touch()
+    swept(bench, scene, tiny, *axes, "--workers", 1, to="here")
+    marker.unlink()
     with distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
         processes=True,
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address=":0",
         silence_logs=50,
     ) as cluster:
-        swept(bench, scene, tiny, *GRID, "--scheduler", cluster.scheduler_address, to="there")
+        swept(bench, scene, tiny, *axes, "--scheduler", cluster.scheduler_address, to="there")
+    assert marker.exists()
     assert tables(Path("here")) == tables(Path("there"))
 
 

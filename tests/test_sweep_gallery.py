@@ -160,7 +160,7 @@ def test_a_heat_map_frames_the_chosen_cell_and_leaves_holes() -> None:
         box = np.array(chart.strips[0])
         assert box[:, 0].min() == top[0] * width
         assert box[:, 1].max() == (2 - top[1]) * height
-        assert [text for _, _, text in chart.values] == ["0", "1", "3", "2"]
+        assert [text for _, _, text in chart.values] == ["0.00", "1.00", "3.00", "2.00"]
     assert heat_chart(x, y, values, (0, 0), metric, 2).values == []
 
 
@@ -170,6 +170,6 @@ def test_a_curve_marks_the_chosen_value() -> None:
     _, mark, line = chart.strips
     assert mark[0][0] == mark[1][0] == line[-1][0]
     assert line[1][1] < line[0][1]
-    assert {"5 mm", "7 mm", "1", "4"} <= {text for _, _, text in chart.labels}
+    assert {"5.00 mm", "7.00 mm", "1", "4"} <= {text for _, _, text in chart.labels}
     assert line_chart(axis, [], 0, Metric("t.m", "m")).strips == []
     assert (digits([0.5, 0.7]), digits([0.90701, 0.90702]), digits([1.0, 1.0])) == (3, 5, 3)

@@ -137,8 +137,8 @@ def _file_sink(path: Path) -> Any:
     return rr.FileSink(str(path))
 
 
-def how_to_open(rrd: Path) -> str:
-    """The command that opens a saved replay, to be copied from the terminal."""
+def how_to_open(rrd: Path | str) -> str:
+    """The command that opens a saved replay or an address, to be copied from the terminal."""
     program = "rerun" if shutil.which("rerun") else rerun_program()
     return f"{shlex.quote(program)} {shlex.quote(str(rrd))}"
 
@@ -208,8 +208,15 @@ def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
     raise DataError(f"the Rerun viewer did not start within {_START_SECONDS:g} s")
 
 
-def take_screenshot(shown: Path | str, picture: Path, window: tuple[int, int]) -> None:
+def take_screenshot(
+    shown: Path | str,
+    picture: Path,
+    window: tuple[int, int],
+    moment: tuple[str, int] | None = None,
+) -> None:
     """A picture of a saved recording, or of what an address of Rerun's shows, with no screen.
+
+    ``moment`` is a timeline and where its cursor is put.
 
     Waits until the viewer's start-up messages are gone and two pictures in a row are the same.
     Needs a Vulkan driver (Debian: mesa-vulkan-drivers).  Raises :class:`DataError`.
@@ -236,6 +243,8 @@ def take_screenshot(shown: Path | str, picture: Path, window: tuple[int, int]) -
         _await_port(port, child)
         client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
         time.sleep(_TOAST_SECONDS)
+        if moment is not None:
+            client.set_time(moment[0], sequence=moment[1])
         before = b""
         deadline = time.monotonic() + _SETTLE_SECONDS
         while time.monotonic() < deadline:

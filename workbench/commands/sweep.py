@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
+import threading
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -65,31 +66,36 @@ def _show(
     as_json: bool,
 ) -> None:
     """Open the gallery where there is a display or one is asked for, and take its picture."""
-    from workbench.sweep.gallery import OVERVIEW, served
+    from workbench.sweep.gallery import CELL_TIMELINE, OVERVIEW, served
     from workbench.viewer import has_display, how_to_open, show, take_screenshot
 
     folder = sweep.request.folder
     overview = folder / OVERVIEW
     wanted = view or (view is None and has_display() and screenshot is None and not as_json)
-    if wanted and not has_display():
-        err.print("no display: the gallery cannot be opened here", soft_wrap=True)
-        wanted = False
     if screenshot is not None:
         grid = screenshot.with_name(f"{screenshot.stem}-grid{screenshot.suffix}")
         with served(folder) as address:
             take_screenshot(address, screenshot, size)
-        take_screenshot(overview, grid, size)
+        best = sweep.choices[0].row.cell.index if sweep.choices else sweep.rows[0].cell.index
+        take_screenshot(overview, grid, size, (CELL_TIMELINE, best))
         if not as_json:
             out.print(f"wrote {screenshot} and {grid}", soft_wrap=True, markup=False)
     if wanted:
         with served(folder) as address, suppress(KeyboardInterrupt):
-            child = show([str(overview), address])
-            err.print("the gallery is served until the viewer is closed, or Ctrl-C", style="dim")
-            child.wait()
+            if has_display():
+                child = show([str(overview), address])
+                says = "the gallery is served until the viewer is closed, or Ctrl-C"
+                err.print(says, style="dim")
+                child.wait()
+            else:
+                says = f"no display: open the gallery with: {how_to_open(address)}"
+                err.print(says, soft_wrap=True, markup=False)
+                err.print("serving until Ctrl-C", style="dim")
+                threading.Event().wait()
     elif not as_json:
         says = f"open the heat maps: {how_to_open(overview)}"
         out.print(says, soft_wrap=True, markup=False)
-        out.print("open the gallery: the same command with --view, where there is a display")
+        out.print("open the gallery: the same command with --view")
 
 
 def replay_line(sweep: Sweep, configuration: Path, frames: str = "", recording: int = 0) -> str:
@@ -106,6 +112,9 @@ def replay_line(sweep: Sweep, configuration: Path, frames: str = "", recording: 
         parts += ["--plugin", str(plugin)]
     if options.until is not None:
         parts += ["--until", options.until]
+    start, stop = options.frames
+    if not frames and (start, stop) != (0, None):
+        frames = f"{start}:{'' if stop is None else stop}"
     if frames:
         parts += ["--frames", frames]
     return shlex.join(parts)
@@ -147,7 +156,8 @@ def _choice_dict(sweep: Sweep, choice: Choice) -> dict[str, Any]:
         "values": dict(choice.row.cell.values),
         "value": choice.row.figures[choice.metric.address],
         "equals": choice.equals,
-        "configuration": str(sweep.request.folder / BEST) if choice is sweep.choices[0] else None,
+        "configuration": str(sweep.configurations[choice.row.cell.index]),
+        "replay": replay_line(sweep, sweep.configurations[choice.row.cell.index]),
         "flat": {
             "cells": list(flat.cells),
             "within": flat.within,

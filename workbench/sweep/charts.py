@@ -95,11 +95,11 @@ def heat_chart(
     width, height = columns * _CELL_WIDTH, rows * _CELL_HEIGHT
     chart = Chart((-0.16 * width - 4, width + 4), (-0.08 * height - 2, height * 1.1 + 4), image)
     if max(rows, columns) <= most_labelled:
-        told = digits(list(values.values()))
+        count = digits(list(values.values()))
         for (row, column), value in np.ndenumerate(grid):
             if math.isfinite(value):
                 x_label, y_label = (column + 0.5) * _CELL_WIDTH, (row + 0.5 - _LIFT) * _CELL_HEIGHT
-                chart.values.append((x_label, y_label, f"{value:.{told}g}"))
+                chart.values.append((x_label, y_label, told(float(value), count)))
     left, bottom = chosen[0] * _CELL_WIDTH, (rows - chosen[1]) * _CELL_HEIGHT
     right, top = left + _CELL_WIDTH, bottom - _CELL_HEIGHT
     box = [(left, top), (right, top), (right, bottom), (left, bottom), (left, top)]
@@ -137,10 +137,10 @@ def line_chart(
     chart.dots = [at(*point) for point in points]
     unit = f" {metric.unit}" if metric.unit else ""
     for value in dict.fromkeys((min(values), max(values))):
-        text = f"{value:.{digits(values)}g}{unit}"
+        text = f"{told(value, digits(values))}{unit}"
         chart.labels.append((-0.1 * _WIDTH, at(0, value)[1], text))
     for place in _ticks(len(axis.values)):
-        chart.labels.append((at(place, low)[0], 1.1 * _HEIGHT, written(axis.values[place])))
+        chart.labels.append((at(place, low)[0], 1.14 * _HEIGHT, written(axis.values[place])))
     return chart
 
 
@@ -155,6 +155,11 @@ def digits(values: Sequence[float]) -> int:
         if low == high or f"{low:.{count}g}" != f"{high:.{count}g}":
             return count
     return 6
+
+
+def told(value: float, count: int) -> str:
+    """A figure in ``count`` significant digits, with its closing zeros, so that columns align."""
+    return f"{value:#.{count}g}".rstrip(".")
 
 
 def written(value: Any) -> str:

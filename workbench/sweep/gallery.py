@@ -485,7 +485,7 @@ def _time_of(axis: Axis, place: int) -> dict[str, Any]:
 def _walk_page(sweep: Sweep, one: _Shown) -> str:
     row = one.row
     best = ", the best" if sweep.choices and row is sweep.choices[0].row else ""
-    lines = [f"**cell {row.cell.index}{best}**", "", "| | |", "|---|---|"]
+    lines = [f"**cell {row.cell.index}{best}**", "", f"`{one.command}`", "", "| | |", "|---|---|"]
     lines += [
         f"| {axis.address} | {row.cell.values[axis.address]} {axis.unit} |"
         for axis in sweep.grid.axes
@@ -496,7 +496,7 @@ def _walk_page(sweep: Sweep, one: _Shown) -> str:
         lines.append(f"| **{metric.address}** | **{shown}** |")
     if row.error:
         lines.append(f"| FAILED | {row.error} |")
-    return "\n".join([*lines, "", f"`{one.command}`"])
+    return "\n".join(lines)
 
 
 def _log_charts(stream: rr.RecordingStream, sweep: Sweep, choice: Choice) -> Any:
@@ -567,7 +567,8 @@ def _summary_page(sweep: Sweep) -> str:
         value = choice.row.figures[metric.address]
         chosen = ", ".join(f"{k} = {v}" for k, v in choice.row.cell.values.items())
         best = f"cell {choice.row.cell.index}: {chosen}"
-        lines += [f"Best **{metric.address}** {value:.4g} {metric.unit}, {best}", ""]
+        figure = f"{value:.4g} {metric.unit}".strip()
+        lines += [f"Best **{metric.address}** {figure}, {best}", ""]
         spans = "; ".join(f"{a} {lo} .. {hi}" for a, (lo, hi) in choice.flat.spans.items())
         lines += [
             f"Flat within {choice.flat.within:.2g}: {len(choice.flat.cells)} cells, {spans}",
@@ -578,6 +579,7 @@ def _summary_page(sweep: Sweep) -> str:
         lines += [f"**{failed} cells failed**", ""]
     lines.append(
         "Choose a parameter's timeline at the bottom left and scrub it: it walks the cells that "
-        "differ from the best in that parameter alone; `cell` walks all of them."
+        "differ from the best in that parameter alone; `cell` walks all of them. Maps and curves "
+        "show the best over the parameters that they leave out."
     )
     return "\n".join(lines)

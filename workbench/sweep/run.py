@@ -509,7 +509,9 @@ def _configurations(
         metric = choices[0].metric if choices else None
         if metric is not None:
             shown.sort(key=lambda row: -metric.worth(row.figures.get(metric.address, math.nan)))
-        shown = sorted(shown[:MOST_CONFIGURATIONS], key=lambda row: row.cell.index)
+        chosen = [choice.row for choice in choices]
+        kept = {row.cell.index: row for row in (*shown[:MOST_CONFIGURATIONS], *chosen)}
+        shown = [kept[index] for index in sorted(kept)]
     digits = max(4, len(str(max(row.cell.index for row in rows))))
     # The same for all: written once, for it is most of each file.
     brief = {key: provenance[key] for key in ("bench", "code", "recordings")}
