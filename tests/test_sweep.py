@@ -325,7 +325,6 @@ def test_a_full_disk_ends_with_one_line_and_keeps_what_was_done(
         (TEN_MILLION, 2, "--sample"),
         (("--axis", "recognition.step=1,2"), 2, "recognition is not run"),
         (("--axis", "dark.level=1,2", "--metric", "nothing.agreed"), 2, "no stage 'nothing'"),
-        (("--axis", "dark.level=1,2", "--metric", "darkest.agrees"), 2, "darkest.agreed"),
         (("--axis", "dark.level=1,2", "--metric", "darkest"), 2, "STAGE.FIGURE"),
         (("--axis", "dark.level=1,2", "--metric", "darkest.agreed:up"), 2, ":higher"),
         (("--axis", "dark.level=1,2", "--workers", "0"), 2, "--workers"),
@@ -346,6 +345,24 @@ def test_a_mistake_is_one_line(
     )
     assert ended.code == code
     assert says in ended.mistake
+
+
+def test_a_figure_that_is_not_there_is_told_early_and_at_the_end(
+    bench: Command, scene: Path, tiny: Path
+) -> None:
+    ended = bench(
+        *("sweep", scene, "--plugin", tiny, "--until", "darkest", "--frames", "0:3"),
+        *("--workers", 1, "--to", "out", "--axis", "dark.level=60,90"),
+        *("--metric", "darkest.agrees"),
+    )
+    early, late = ended.err.splitlines()
+    assert early.startswith("warning: --metric darkest.agrees: no such figure so far")
+    assert "darkest.agreed" in early
+    assert late.startswith("workbench: --metric darkest.agrees: no such figure")
+    assert ended.code == 2
+    # Nothing is lost: with the right name the same sweep is there at once.
+    said = swept(*(bench, scene, tiny, "--axis", "dark.level=60,90", "--metric", "darkest.agreed"))
+    assert said["spent"]["computed"] == 0
 
 
 def test_another_file_in_the_place_of_the_kept_results_is_told(

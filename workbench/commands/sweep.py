@@ -45,7 +45,7 @@ def run(
 
     try:
         with progress_to("sweep") as advance:
-            sweep = sweeping.run(request, advance, draw)
+            sweep = sweeping.run(request, advance, draw, _warn)
     except KeyboardInterrupt:
         err.print("interrupted; what was done is kept, and the same command goes on from there")
         raise
@@ -56,6 +56,10 @@ def run(
     _show(sweep, view, screenshot, size, as_json)
     if all(row.failed_frames for row in sweep.rows):
         raise typer.Exit(EXIT_FAILED)
+
+
+def _warn(says: str) -> None:
+    err.print(f"warning: {says}", style="yellow", soft_wrap=True, markup=False)
 
 
 def _show(

@@ -17,7 +17,7 @@ from workbench.sweep.plan import Job
 from workbench.sweep.table import FrameRow, Metric, Row, slug
 
 _HELD_FRAMES = 20_000
-_STABILITY = "stability"
+STABILITY = "stability"
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ def add_stability(
                 shares.setdefault(cell.index, []).append(known[pair])
     if not shares:
         return
-    address = f"{stage}.{_STABILITY}"
+    address = f"{stage}.{STABILITY}"
     metrics[address] = Metric(address, "stability: overlap with neighbouring cells", "", "higher")
     for index, values in shares.items():
         by_index[index].figures[address] = math.fsum(sorted(values)) / len(values)

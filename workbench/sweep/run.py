@@ -26,7 +26,7 @@ from workbench.sweep.cache import Cache
 from workbench.sweep.engines import default_workers, outcomes
 from workbench.sweep.pictures import can_draw
 from workbench.sweep.plan import Block, Job, blocks_of, in_tree_order, result_keys, tasks_of
-from workbench.sweep.results import Reader, add_stability, frame_rows, mean_ms
+from workbench.sweep.results import STABILITY, Reader, add_stability, frame_rows, mean_ms
 from workbench.sweep.table import Metric, Row, write_cells, write_frames
 
 CACHE = Path(".cache") / "results.sqlite"
@@ -34,6 +34,7 @@ CELLS_TABLE = "cells.parquet"
 FRAMES_TABLE = "frames.parquet"
 BEST = "best.toml"
 CONFIGURATIONS = "cells"
+_FEW = 64
 MOST_CONFIGURATIONS = 2000
 """Cells that get a configuration file and a place in the gallery; of more, the best."""
 
@@ -100,11 +101,13 @@ def run(
     request: Request,
     advance: Callable[[int, int], None] | None = None,
     finish: Callable[[Sweep, Cache], None] | None = None,
+    warn: Callable[[str], None] | None = None,
 ) -> Sweep:
     """Do what the request asks for and write its tables.
 
     ``advance`` is told how many cells times frames are done, of how many.  ``finish`` is called
-    with the finished sweep while what it kept is still open, for pictures.  Raises
+    with the finished sweep while what it kept is still open, for pictures; ``warn`` is told at
+    once what looks like a mistake but may come to be right.  Raises
     :class:`UsageError` or :class:`DataError` with one line; what was done until then is kept and
     not done again.
     """
@@ -129,7 +132,20 @@ def run(
     _make(request.folder)
     with Cache(request.folder / CACHE) as cache:
         spent = Spent()
-        _compute(request, job, sessions, spans, cells, keys, cache, spent, advance)
+
+        def look() -> None:
+            """After the first task: does anything have the figures that were asked for?"""
+            early = Reader(job, spans, keys, cache, frozenset())
+            for text, (address, _) in zip(request.metrics, asked, strict=True):
+                stage = next(s for s in first.stages if s.name == address.partition(".")[0])
+                few = cells[:_FEW]
+                seen = {m.address for cell in few for m, _ in early.result(cell, stage).metrics}
+                seen.add(f"{stage.name}.{STABILITY}")
+                if warn is not None and len(seen) > 1 and address not in seen:
+                    listed = ", ".join(sorted(seen))
+                    warn(f"--metric {text}: no such figure so far; there are: {listed}")
+
+        _compute(request, job, sessions, spans, cells, keys, cache, spent, advance, look)
         interrupts.check()
         sweep = _finished(
             request, job, sessions, spans, whole, cells, keys, stages, cache, spent, asked
@@ -283,6 +299,7 @@ def _compute(
     cache: Cache,
     spent: Spent,
     advance: Callable[[int, int], None] | None,
+    look: Callable[[], None],
 ) -> None:
     workers = request.workers or default_workers(request.scheduler)
     cache.forget_failures()
@@ -308,6 +325,8 @@ def _compute(
     source_of = {task.number: job.sources[task.recording] for task in tasks}
     for outcome in outcomes(job, tasks, workers, request.scheduler):
         cache.put(source_of[outcome.task], outcome.seen, outcome.kept)
+        if not spent.workers:
+            look()
         spent.workers += outcome.seconds
         spent.stages += outcome.stage_seconds
         done += sizes[outcome.task]
