@@ -323,17 +323,21 @@ def dependencies(stages: Iterable[Stage]) -> list[tuple[str, str, str]]:
     ]
 
 
+_PLAIN = frozenset((float, int, str, bool, type(None)))
+
+
 def _bytes_of(value: Any, seen: set[int]) -> int:
     """Bytes of the arrays that a value holds, through dataclasses and containers, each once."""
-    if isinstance(value, float | int | str) or id(value) in seen:
+    if id(value) in seen:
         return 0
     seen.add(id(value))
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, Mapping):
-        return sum(_bytes_of(item, seen) for item in value.values())
+        return _bytes_of(list(value.values()), seen)
     if isinstance(value, list | tuple):
-        return sum(_bytes_of(item, seen) for item in value)
+        # Numbers and texts are by far the most of what lists hold, and no arrays.
+        return sum(_bytes_of(item, seen) for item in value if type(item) not in _PLAIN)
     if is_dataclass(value) and not isinstance(value, type):
         return sum(_bytes_of(getattr(value, f.name), seen) for f in fields(value))
     return 0

@@ -146,6 +146,7 @@ def as_dict(sweep: Sweep) -> dict[str, Any]:
             "seconds": round(sweep.spent.total, 3),
             "worker_seconds": round(sweep.spent.workers, 3),
             "stage_seconds": round(sweep.spent.stages, 3),
+            "scoring_seconds": round(sweep.spent.scoring, 3),
         },
         "provenance": sweep.provenance,
     }

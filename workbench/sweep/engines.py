@@ -19,6 +19,8 @@ from workbench.sweep.worker import Outcome, work
 
 MOST_RETRIES = 3
 """How often in a row workers may die without one task done in between."""
+_IDLE_SECONDS = 10
+"""After which a worker without work ends: those of a sweep that was killed must not stay."""
 
 
 def cores() -> int:
@@ -56,7 +58,9 @@ def _on_machine(job: Job, tasks: Sequence[Task], workers: int) -> Iterator[Outco
     deaths = 0
     try:
         while waiting:
-            with parallel_config(backend="loky", inner_max_num_threads=1):
+            with parallel_config(
+                backend="loky", inner_max_num_threads=1, idle_worker_timeout=_IDLE_SECONDS
+            ):
                 run = Parallel(
                     n_jobs=min(workers, len(waiting)),
                     return_as="generator_unordered",

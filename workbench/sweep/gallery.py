@@ -247,19 +247,24 @@ def _write_cell(
             label = sweep.choices[0].metric.address
             stream.log("figure", rr.SeriesLines(names=label, colors=_CURVE), static=True)
             stream.log("figure", rr.SeriesPoints(colors=_CURVE, marker_sizes=3), static=True)
-        for recording, frame, value in one.series:
-            _set_frame(stream, sweep, recording, frame)
-            stream.log("figure", rr.Scalars(value))
+        if one.series:
+            times = [_position(sweep, recording, frame) for recording, frame, _ in one.series]
+            stream.send_columns(
+                "figure",
+                [rr.TimeColumn(FRAME_TIMELINE, sequence=times)],
+                rr.Scalars.columns(scalars=[value for _, _, value in one.series]),
+            )
         for recording, frame, image in one.pictures:
-            _set_frame(stream, sweep, recording, frame)
+            stream.set_time(FRAME_TIMELINE, sequence=_position(sweep, recording, frame))
             stream.log("picture", rr.EncodedImage(contents=image, media_type=_PNG))
 
 
-def _set_frame(stream: rr.RecordingStream, sweep: Sweep, recording: int, frame: int) -> None:
-    """Frames of several recordings follow one another on one timeline."""
+def _position(sweep: Sweep, recording: int, frame: int) -> int:
+    """A frame's place on the timeline, on which recordings follow one another."""
+    if recording == 0:
+        return frame
     before = sum(len(own) for own in sweep.frames[:recording])
-    position = before + sweep.frames[recording].index(frame) if recording else frame
-    stream.set_time(FRAME_TIMELINE, sequence=position)
+    return before + sweep.frames[recording].index(frame)
 
 
 def _cell_page(sweep: Sweep, one: _Shown, command: Command) -> str:

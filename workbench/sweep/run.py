@@ -68,7 +68,9 @@ class Spent:
     workers: float = 0.0
     """In the workers, summed over them."""
     stages: float = 0.0
-    """Of that, in the stages' own code."""
+    """Of that, in the stages' computing."""
+    scoring: float = 0.0
+    """Of that, in the stages' scorers and figures."""
     computing: float = 0.0
     """On the clock, while results were computed."""
     total: float = 0.0
@@ -329,6 +331,7 @@ def _compute(
             look()
         spent.workers += outcome.seconds
         spent.stages += outcome.stage_seconds
+        spent.scoring += outcome.scoring_seconds
         done += sizes[outcome.task]
         if advance is not None:
             advance(done, total)

@@ -41,7 +41,9 @@ class Outcome:
     kept: tuple[Kept, ...]
     seconds: float
     stage_seconds: float
-    """Spent in the stages' own code, each result counted once."""
+    """Spent in the stages' computing, each result counted once."""
+    scoring_seconds: float
+    """Spent in the stages' scorers and figures."""
 
 
 _alone = threading.Lock()
@@ -125,7 +127,7 @@ def _work(opened: _Opened, job: Job, task: Task, start: float) -> Outcome:
     pipelines = [_pipeline(opened, values) for values in task.cells]
     seen = dict.fromkeys(range(task.start, task.stop), False)
     kept: list[Kept] = []
-    stage_seconds = 0.0
+    stage_seconds = scoring_seconds = 0.0
     required, optional = session.pipeline.channels
     for frame in session.recording.frames(required, optional, task.start, task.stop):
         seen[frame.index] = True
@@ -139,11 +141,13 @@ def _work(opened: _Opened, job: Job, task: Task, start: float) -> Outcome:
                 if key not in done:
                     done.add(key)
                     picture = drawing and stage.name == job.picture_stage
-                    kept.append(_kept(opened, stage, key, run, picture))
+                    found, seconds = _kept(opened, stage, key, run, picture)
+                    kept.append(found)
+                    scoring_seconds += seconds
         # No other frame can ask for these.
         session.pipeline.store.clear()
     seconds = time.perf_counter() - start
-    return Outcome(task.number, seen, tuple(kept), seconds, stage_seconds)
+    return Outcome(task.number, seen, tuple(kept), seconds, stage_seconds, scoring_seconds)
 
 
 def _pipeline(opened: _Opened, values: Mapping[str, Any]) -> tuple[Pipeline, dict[str, str]]:
@@ -158,15 +162,18 @@ def _pipeline(opened: _Opened, values: Mapping[str, Any]) -> tuple[Pipeline, dic
     return opened.cells[where]
 
 
-def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> Kept:
-    """What is kept of one stage's result: nothing of it depends on stages that come later."""
+def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> tuple[Kept, float]:
+    """What is kept of one stage's result, and the seconds that the stage took to score it.
+
+    Nothing of it depends on stages that come later.
+    """
     record: dict[str, Any] = {}
     failure = next((one for one in run.failures if one.stage == stage.name), None)
     index = run.frame.index
     if failure is not None:
         record["says"] = failure.says
         record["blocked_by"] = failure.blocked_by
-        return Kept(key, index, True, packed(record), None, None)
+        return Kept(key, index, True, packed(record), None, None), 0.0
     artifacts = {
         name: value for name, value in run.artifacts.items() if name in opened.visible[stage.name]
     }
@@ -177,6 +184,7 @@ def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> K
         record["warnings"] = warnings
     outline: bytes | None = None
     image: bytes | None = None
+    start = time.perf_counter()
     try:
         scorer = stage.scorer()
         if scorer is not None and run.frame.truth is not None:
@@ -186,9 +194,10 @@ def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> K
                 record["stateless"] = True
             else:
                 record["state"] = state
-        figures = [asdict(score) for score in stage.figures(artifacts)]
+        figures = stage.figures(artifacts)
+        seconds = time.perf_counter() - start
         if figures:
-            record["figures"] = figures
+            record["figures"] = [asdict(score) for score in figures]
         outline = outline_of(stage, artifacts)
         if picture:
             image = drawn(stage, artifacts)
@@ -197,8 +206,8 @@ def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> K
         # As a replay counts it: the stage's own result stands, what tells of it does not.
         says = f"scoring: {one_line(error)}"
         data = packed({"ms": record["ms"], "says": says, "blocked_by": None})
-        return Kept(key, index, True, data, None, None)
-    return Kept(key, index, False, data, outline, image)
+        return Kept(key, index, True, data, None, None), time.perf_counter() - start
+    return Kept(key, index, False, data, outline, image), seconds
 
 
 def _finite(values: Mapping[str, float]) -> dict[str, float]:
