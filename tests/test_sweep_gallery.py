@@ -8,6 +8,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -127,6 +129,15 @@ def test_a_sweep_without_a_chosen_figure_has_a_gallery_too(
     assert "dark.share" in ended.out
     assert not Path("out/best.toml").exists()
     assert len(list(Path("out/gallery").glob("*.rrd"))) == 2
+
+
+def test_frames_of_several_recordings_follow_one_another() -> None:
+    from workbench.sweep.gallery import _position
+
+    # The second frame of the first recording does not decode.
+    sweep: Any = SimpleNamespace(frames=[[1, 3], [1, 2], [0, 5]])
+    places = [_position(sweep, r, f) for r, frames in enumerate(sweep.frames) for f in frames]
+    assert places == [1, 3, 4, 5, 6, 7]
 
 
 def test_workers_never_import_rerun() -> None:

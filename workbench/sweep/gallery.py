@@ -263,7 +263,8 @@ def _position(sweep: Sweep, recording: int, frame: int) -> int:
     """A frame's place on the timeline, on which recordings follow one another."""
     if recording == 0:
         return frame
-    before = sum(len(own) for own in sweep.frames[:recording])
+    first, *others = sweep.frames[:recording]
+    before = (first[-1] + 1 if first else 0) + sum(len(own) for own in others)
     return before + sweep.frames[recording].index(frame)
 
 
