@@ -30,6 +30,7 @@ from workbench.stage import (
     Inputs,
     Logged,
     Outputs,
+    Score,
     Scorer,
     Stage,
     StageParameters,
@@ -400,6 +401,21 @@ class DepthCloud(Stage):
         from stages.dfd.score import DepthScorer
 
         return DepthScorer()
+
+    def figures(self, artifacts: Mapping[str, Any]) -> list[Score]:
+        import numpy as np
+
+        known = float(np.isfinite(artifacts["depth_relative"]).mean())
+        trust = float(artifacts["confidence"].mean())
+        return [
+            Score("coverage", known, better="higher"),
+            Score("confidence", trust, better="higher"),
+        ]
+
+    def picture(self, artifacts: Mapping[str, Any]) -> Any:
+        from stages.pictures import depth_rgb
+
+        return depth_rgb(artifacts["depth_relative"], 0.0, 1.0)
 
 
 @dataclass(frozen=True)

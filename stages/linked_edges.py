@@ -26,6 +26,7 @@ from workbench.stage import (
     Inputs,
     Logged,
     Outputs,
+    Score,
     Scorer,
     Stage,
     StageParameters,
@@ -285,6 +286,18 @@ class LinkedEdges(Stage):
         from stages.edges.scorers import EdgeScorer
 
         return EdgeScorer({"edges_reconstructed": "reconstructed", "edges_linked": "linked"})
+
+    def figures(self, artifacts: Mapping[str, Any]) -> list[Score]:
+        ends = len(artifacts["terminators"])
+        if not ends:
+            return []
+        left = len(artifacts["linking"].linked.open_ends)
+        return [Score("linked terminators", 1 - left / ends, better="higher")]
+
+    def picture(self, artifacts: Mapping[str, Any]) -> Any:
+        from stages.pictures import linked_rgb
+
+        return linked_rgb(artifacts["edge_step"], artifacts["region_lines"])
 
 
 def windows_up_to(reach_px: float) -> tuple[float, ...]:

@@ -22,6 +22,7 @@ from workbench.stage import (
     Inputs,
     Logged,
     Outputs,
+    Score,
     Scorer,
     Stage,
     StageParameters,
@@ -260,6 +261,12 @@ class Recognition(Stage):
         from stages.matching.scorers import RecognitionScorer
 
         return RecognitionScorer()
+
+    def figures(self, artifacts: Mapping[str, Any]) -> list[Score]:
+        verdict = artifacts["verdict"]
+        if verdict is None:
+            return []
+        return [Score("picks", float(verdict["verdict"] == "pick"), better="higher")]
 
 
 def rules_of(parameters: Any) -> Any:

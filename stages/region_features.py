@@ -20,6 +20,7 @@ from workbench.stage import (
     Inputs,
     Logged,
     Outputs,
+    Score,
     Scorer,
     Stage,
     StageParameters,
@@ -186,6 +187,21 @@ class RegionFeatures(Stage):
         from stages.edges.scorers import RegionScorer
 
         return RegionScorer()
+
+    def figures(self, artifacts: Mapping[str, Any]) -> list[Score]:
+        from stages.edges.regions import closed_share
+
+        count = int((~artifacts["regions"]["background"]).sum())
+        share = closed_share(artifacts["labels"], artifacts["region_lines"])
+        return [
+            Score("closed lines", share, better="higher"),
+            Score("regions", float(count), "regions"),
+        ]
+
+    def picture(self, artifacts: Mapping[str, Any]) -> Any:
+        from stages.pictures import regions_rgb
+
+        return regions_rgb(artifacts["intensity"], artifacts["labels"], artifacts["regions"])
 
 
 def as_rows(table: Any) -> Any:

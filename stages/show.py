@@ -15,9 +15,9 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-UNKNOWN_COLOUR = (62, 62, 70)
-DARK = (14, 14, 16)
-_SHADOW_COLOUR = (95, 95, 105)
+from stages.pictures import DARK as DARK
+from stages.pictures import UNKNOWN_COLOUR, linked_rgb
+
 _CHART_WIDTH, _CHART_HEIGHT = 100.0, 60.0
 _TICK_COLOUR = (90, 150, 215)  # readable on the labels of the dark and of the light theme
 _BAR_STEPS = 64
@@ -161,17 +161,7 @@ def edge_image(edges: np.ndarray) -> Any:
 
 def linked_image(step: np.ndarray, lines: np.ndarray) -> Any:
     """Lines [H W] by the step that drew them: the paper shades its links (figure 7)."""
-    from stages.edges.linking import Step
-
-    rgb = np.full((*step.shape, 3), DARK, np.uint8)
-    rgb[lines] = _SHADOW_COLOUR
-    for first, colour in (
-        (Step.LOW, (255, 255, 255)),
-        (Step.LINK, (255, 150, 40)),
-        (Step.CREASE, (80, 160, 255)),
-    ):
-        rgb[lines & (step >= first)] = colour
-    return rr.Image(rgb)
+    return rr.Image(linked_rgb(step, lines))
 
 
 def log_chart(

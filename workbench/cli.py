@@ -544,6 +544,109 @@ def simulate(
     command.run(scene, output, seed, parse_frames(frames), as_json)
 
 
+@app.command()
+def sweep(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="Recordings, MCAP files.", metavar="REC…")
+    ],
+    axis: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A parameter and its values: A,B,C or LO:HI:STEP or LO:HI:xN (N values, equal "
+            "factors apart).",
+            metavar="STAGE.PARAMETER=VALUES",
+        ),
+    ] = None,
+    zipped: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--zip", help="Axes that move together instead of crossing.", metavar="AXIS,AXIS"
+        ),
+    ] = None,
+    sample: Annotated[
+        int | None, typer.Option(help="Only so many cells, drawn from the grid.", metavar="N")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="What --sample draws by.")] = 0,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What the best cell is chosen by (the first), and what is drawn; without one the "
+            "figures that there are get listed.",
+            metavar="STAGE.FIGURE",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes; one for each core if not given.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="A Dask scheduler to work on instead.", metavar="tcp://HOST:PORT"),
+    ] = None,
+    to: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for tables, gallery and kept results; REC-sweep here if not given.",
+            metavar="DIR",
+        ),
+    ] = None,
+    pictures: Annotated[int, typer.Option(help="Frames of which each cell keeps a picture.")] = 4,
+    view: Annotated[
+        bool | None,
+        typer.Option("--view/--no-view", help="Open the gallery; if not given, on a display."),
+    ] = None,
+    screenshot: Annotated[
+        Path | None,
+        typer.Option(
+            help="Take a picture (PNG) of the gallery, and NAME-grid.png of the heat maps; needs "
+            "no screen."
+        ),
+    ] = None,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1920x1080",
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Try a grid of parameters; what cells have in common is computed once and kept."""
+    from workbench.commands import sweep as command
+    from workbench.sweep.run import Request
+
+    options = _options(
+        recordings[0],
+        calibration,
+        models,
+        preset,
+        config,
+        assignments,
+        topic,
+        frames,
+        until,
+        plugin,
+    )
+    request = Request(
+        options,
+        recordings,
+        to or Path(f"{recordings[0].stem}-sweep"),
+        axis or [],
+        zipped or [],
+        sample,
+        seed,
+        metric or [],
+        workers,
+        scheduler,
+        pictures,
+    )
+    command.run(request, view, screenshot, window, as_json)
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
     interrupts.install()

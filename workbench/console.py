@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn, TypeVar
 
@@ -45,7 +45,22 @@ class _Rate(ProgressColumn):
 @contextmanager
 def progress(description: str, total: int | None) -> Iterator[Any]:
     """A progress bar on stderr, only on a terminal; yields ``advance()``."""
-    bar = Progress(
+    with _bar() as bar:
+        task = bar.add_task(description, total=total)
+        yield lambda: bar.advance(task)
+
+
+@contextmanager
+def progress_to(description: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar as :func:`progress` for work that may be done in part; yields
+    ``reached(done, total)``."""
+    with _bar() as bar:
+        task = bar.add_task(description, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _bar() -> Progress:
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -55,9 +70,6 @@ def progress(description: str, total: int | None) -> Iterator[Any]:
         disable=not err.is_terminal,
         transient=True,
     )
-    with bar:
-        task = bar.add_task(description, total=total)
-        yield lambda: bar.advance(task)
 
 
 def tracked(items: Iterable[T], description: str, total: int | None) -> Iterator[T]:

@@ -24,7 +24,12 @@ def digest_of(parts: Iterable[Any]) -> str:
     """
     h = hashlib.blake2b(digest_size=_DIGEST_BYTES)
     for part in parts:
-        if isinstance(part, np.ndarray):
+        if type(part) is str:
+            # The commonest by far, and met in the inner loop of a sweep.
+            data = repr(part).encode()
+            h.update(b"str %d;" % len(data))
+            h.update(data)
+        elif isinstance(part, np.ndarray):
             h.update(f"array {part.dtype.str} {part.shape};".encode())
             h.update(np.ascontiguousarray(part).data)
         else:

@@ -89,6 +89,11 @@ class ResultStore:
             _, dropped = self._results.popitem(last=False)
             self._bytes -= dropped.size
 
+    def clear(self) -> None:
+        """Drop everything, as when no later frame can ask for it."""
+        self._results.clear()
+        self._bytes = 0
+
 
 class Pipeline:
     """Stages in an order in which each finds what it needs.
@@ -116,12 +121,15 @@ class Pipeline:
             if path is not None and need.load is not None:
                 self.resources[need.name] = _load(need, path)
         self._code = {s.name: digest_of_code(type(s).__module__) for s in self.stages}
+        self._texts = self._parameter_texts()
         self._warm: set[str] = set()
+        self._taken: list[tuple[Frame, dict[str, Any], dict[str, str]]] = []
 
     def with_settings(self, settings: Settings) -> Pipeline:
         """The same stages and resources under other parameters, with results kept in common."""
         other = copy.copy(self)
         other.settings = settings
+        other._texts = other._parameter_texts()
         return other
 
     def up_to(self, stage: str) -> Pipeline:
@@ -133,6 +141,9 @@ class Pipeline:
         other = copy.copy(self)
         other.stages = list(stages)
         return other
+
+    def _parameter_texts(self) -> dict[str, str]:
+        return {s.name: self.settings.parameters[s.name].model_dump_json() for s in self.stages}
 
     def sources(self, kind: type[S]) -> list[S]:
         """The needs of one kind that no stage gives, without doubles; required where any is."""
@@ -163,9 +174,7 @@ class Pipeline:
 
     def run(self, frame: Frame) -> Run:
         """The frame through all stages.  A stage's exception never hides the others' results."""
-        artifacts: dict[str, Any] = {}
-        digests: dict[str, str] = {}
-        self._take_sources(frame, artifacts, digests)
+        artifacts, digests = self._sources_of(frame)
         failures: list[Failure] = []
         failed_givers: dict[str, str] = {}
         warnings: list[str] = []
@@ -181,7 +190,7 @@ class Pipeline:
                 continue
             parameters = self.settings.parameters[stage.name]
             key = digest_of(
-                [stage.name, self._code[stage.name], parameters.model_dump_json()]
+                [stage.name, self._code[stage.name], self._texts[stage.name]]
                 + [f"{n.name} {digests.get(n.name)}" for n in stage.needs]
             )
             result = self.store.get(key)
@@ -196,7 +205,7 @@ class Pipeline:
                 self.store.put(key, result)
                 computed.add(stage.name)
             artifacts.update(result.outputs)
-            digests.update((a.name, digest_of([key, a.name])) for a in stage.gives)
+            digests.update((a.name, f"{key} {a.name}") for a in stage.gives)
             warnings += [f"{stage.name}: {says}" for says in result.warnings]
             stage_ms[stage.name] = result.milliseconds
         return Run(
@@ -208,6 +217,17 @@ class Pipeline:
             MappingProxyType(stage_ms),
             frozenset(computed),
         )
+
+    def _sources_of(self, frame: Frame) -> tuple[dict[str, Any], dict[str, str]]:
+        """What no stage gives, and its digests; of the latest frame they are remembered."""
+        if not (self._taken and self._taken[0][0] is frame):
+            artifacts: dict[str, Any] = {}
+            digests: dict[str, str] = {}
+            self._take_sources(frame, artifacts, digests)
+            # In place: pipelines with other settings share it.
+            self._taken[:] = [(frame, artifacts, digests)]
+        _, artifacts, digests = self._taken[0]
+        return dict(artifacts), dict(digests)
 
     def _take_sources(
         self, frame: Frame, artifacts: dict[str, Any], digests: dict[str, str]
@@ -313,6 +333,9 @@ def dependencies(stages: Iterable[Stage]) -> list[tuple[str, str, str]]:
     ]
 
 
+_PLAIN = frozenset((float, int, str, bool, type(None)))
+
+
 def _bytes_of(value: Any, seen: set[int]) -> int:
     """Bytes of the arrays that a value holds, through dataclasses and containers, each once."""
     if id(value) in seen:
@@ -321,9 +344,10 @@ def _bytes_of(value: Any, seen: set[int]) -> int:
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, Mapping):
-        return sum(_bytes_of(item, seen) for item in value.values())
+        return _bytes_of(list(value.values()), seen)
     if isinstance(value, list | tuple):
-        return sum(_bytes_of(item, seen) for item in value)
+        # Numbers and texts are by far the most of what lists hold, and no arrays.
+        return sum(_bytes_of(item, seen) for item in value if type(item) not in _PLAIN)
     if is_dataclass(value) and not isinstance(value, type):
         return sum(_bytes_of(getattr(value, f.name), seen) for f in fields(value))
     return 0

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import platform
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from workbench import interrupts
@@ -102,7 +104,7 @@ class Session:
                 stage.name: pipeline.settings.as_dict()[stage.name] for stage in pipeline.stages
             },
             "code": pipeline.code_digests(),
-            "libraries": _library_versions(),
+            "libraries": dict(library_versions()),
             "python": platform.python_version(),
         }
 
@@ -167,11 +169,13 @@ def bench_version() -> str:
         return "not installed"
 
 
-def _library_versions() -> dict[str, str]:
+@functools.cache
+def library_versions() -> Mapping[str, str]:
+    """The installed versions of the libraries that results depend on."""
     found = {}
     for name in _IDENTIFIED_LIBRARIES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found | {"platform": sys.platform}
+    return MappingProxyType(found | {"platform": sys.platform})

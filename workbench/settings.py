@@ -89,25 +89,51 @@ def adjusted(
 
     Raises :class:`SettingsError` for an unknown address or a value that its knob refuses.
     """
-    laid = settings.as_dict()
+    laid: dict[str, dict[str, Any]] = {}
     for address, value in values.items():
         stage_name, parameter = _address(address, stages, address)
-        laid[stage_name][parameter] = value
-    return _settled(stages, settings.preset, laid)
+        before = settings.parameters[stage_name]
+        laid.setdefault(stage_name, before.model_dump())[parameter] = value
+    return _compared(
+        stages,
+        settings.preset,
+        {
+            name: _validate(stage, laid[name]) if name in laid else settings.parameters[name]
+            for name, stage in stages.items()
+        },
+    )
 
 
 def _settled(
     stages: Mapping[str, Stage], preset: str, values: Mapping[str, Mapping[str, Any]]
 ) -> Settings:
     parameters = {name: _validate(stage, values[name]) for name, stage in stages.items()}
+    return _compared(stages, preset, parameters)
+
+
+def _compared(
+    stages: Mapping[str, Stage], preset: str, parameters: Mapping[str, StageParameters]
+) -> Settings:
+    """Settings that remember where these parameters differ from the preset."""
     changed: dict[str, Any] = {}
     for name, stage in stages.items():
-        unchanged = _validate(stage, stage.presets.get(preset, {}))
+        unchanged = _of_preset(stage, preset)
         for key in type(unchanged).model_fields:
             value = getattr(parameters[name], key)
             if value != getattr(unchanged, key):
                 changed[f"{name}.{key}"] = value
     return Settings(preset, parameters, changed)
+
+
+_presets: dict[tuple[type[Stage], str], StageParameters] = {}
+
+
+def _of_preset(stage: Stage, preset: str) -> StageParameters:
+    """The parameters that a stage has under a preset alone, checked once for each class."""
+    where = (type(stage), preset)
+    if where not in _presets:
+        _presets[where] = _validate(stage, stage.presets.get(preset, {}))
+    return _presets[where]
 
 
 def to_toml(

@@ -241,10 +241,15 @@ class Finding:
     about: str = ""
 
 
+Better = Literal["higher", "lower", "zero"]
+"""Which values of a figure are better; ``zero`` is for signed ones, such as a bias."""
+
+
 @dataclass(frozen=True)
 class Score:
     """One figure of :meth:`Scorer.summary`: its value, unit, and how much it covers (0..1).
 
+    ``better`` says which way is better, so that a sweep can choose by it; None if neither is.
     ``published`` is what the publication that the stage implements reports for it, in its own
     words; ``evaluate`` sets the two side by side.
     """
@@ -254,11 +259,17 @@ class Score:
     unit: str = ""
     coverage: float | None = None
     note: str = ""
+    better: Better | None = None
     published: str = ""
 
 
 class Scorer:
-    """Compares a stage's outputs with ground truth, frame by frame, in bounded memory."""
+    """Compares a stage's outputs with ground truth, frame by frame, in bounded memory.
+
+    A scorer whose :meth:`state` and :meth:`take` are implemented can be put together from
+    others, each of which saw some of the frames: a sweep scores every frame once, wherever, and
+    keeps the state.  Without them a sweep has the means of what :meth:`add` returns.
+    """
 
     def add(self, truth: Any, artifacts: Mapping[str, Any]) -> dict[str, float]:
         """Take one frame in; return its own numbers (they become plots over time)."""
@@ -266,6 +277,14 @@ class Scorer:
 
     def summary(self) -> list[Score]:
         """The figures over every frame taken in so far."""
+        raise NotImplementedError
+
+    def state(self) -> Mapping[str, Any] | None:
+        """All that was taken in so far, as numbers, texts, lists, mappings and numpy arrays."""
+        return None
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        """Take in the :meth:`state` of another scorer of this kind, as if its frames came next."""
         raise NotImplementedError
 
 
@@ -324,4 +343,19 @@ class Stage:
 
     def scorer(self) -> Scorer | None:
         """A fresh scorer against ground truth, if this stage can be scored."""
+        return None
+
+    def figures(self, artifacts: Mapping[str, Any]) -> Sequence[Score]:
+        """What can be said of one frame's results without ground truth: shares, counts.
+
+        ``artifacts`` holds everything known of the frame.  A sweep has the means over frames.
+        """
+        return ()
+
+    def picture(self, artifacts: Mapping[str, Any]) -> np.ndarray | None:
+        """This stage's result as one image [H W] or [H W 3] uint8, for a gallery of many runs.
+
+        No Rerun in here: the workers of a sweep draw it.  None leaves it to the bench, which
+        shows the last image among what the stage gives.
+        """
         return None

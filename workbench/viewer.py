@@ -137,8 +137,8 @@ def _file_sink(path: Path) -> Any:
     return rr.FileSink(str(path))
 
 
-def how_to_open(rrd: Path) -> str:
-    """The command that opens a saved replay, to be copied from the terminal."""
+def how_to_open(rrd: Path | str) -> str:
+    """The command that opens a saved replay or an address, to be copied from the terminal."""
     program = "rerun" if shutil.which("rerun") else rerun_program()
     return f"{shlex.quote(program)} {shlex.quote(str(rrd))}"
 
@@ -180,6 +180,19 @@ def _start_viewer(
     return child, url
 
 
+def show(shown: list[str]) -> subprocess.Popen[bytes]:
+    """A native viewer with these files and addresses.  Raises :class:`DataError`."""
+    port = free_port()
+    child = subprocess.Popen(
+        [rerun_program(), "--bind", LOOPBACK, "--port", str(port), *shown],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    _await_port(port, child)
+    return child
+
+
 def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline:
@@ -195,8 +208,15 @@ def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
     raise DataError(f"the Rerun viewer did not start within {_START_SECONDS:g} s")
 
 
-def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
-    """A picture of a saved recording as the native viewer shows it, with no screen.
+def take_screenshot(
+    shown: Path | str,
+    picture: Path,
+    window: tuple[int, int],
+    moment: tuple[str, int] | None = None,
+) -> None:
+    """A picture of a saved recording, or of what an address of Rerun's shows, with no screen.
+
+    ``moment`` is a timeline and where its cursor is put.
 
     Waits until the viewer's start-up messages are gone and two pictures in a row are the same.
     Needs a Vulkan driver (Debian: mesa-vulkan-drivers).  Raises :class:`DataError`.
@@ -214,7 +234,7 @@ def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
             str(port),
             "--window-size",
             f"{window[0]}x{window[1]}",
-            str(rrd),
+            str(shown),
         ],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -223,6 +243,8 @@ def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
         _await_port(port, child)
         client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
         time.sleep(_TOAST_SECONDS)
+        if moment is not None:
+            client.set_time(moment[0], sequence=moment[1])
         before = b""
         deadline = time.monotonic() + _SETTLE_SECONDS
         while time.monotonic() < deadline:

@@ -157,6 +157,23 @@ class _Errors:
         below = np.searchsorted(np.cumsum(self.histogram), percent / 100 * self.known)
         return float((below + 0.5) * _BIN_MM)
 
+    def state(self) -> dict[str, Any]:
+        """Everything, with the histogram's filled bins alone, for most are empty."""
+        filled = np.flatnonzero(self.histogram)
+        return {
+            "sums": [self.pixels, self.known, self.total, self.squares],
+            "bins": filled.astype(np.uint16),
+            "counts": self.histogram[filled].astype(np.uint32),
+        }
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        pixels, known, total, squares = state["sums"]
+        self.pixels += pixels
+        self.known += known
+        self.total += total
+        self.squares += squares
+        self.histogram[state["bins"]] += state["counts"]
+
 
 class DepthScorer(Scorer):
     """Figures of the depth against ``truth``.
@@ -164,6 +181,8 @@ class DepthScorer(Scorer):
     Frames without truth or calibration are skipped, and so are printed dot grids, on which no
     pattern is projected.
     """
+
+    _KINDS = ("interior", "edges", "table", "planes")
 
     def __init__(self) -> None:
         self.interior = _Errors()
@@ -248,31 +267,42 @@ class DepthScorer(Scorer):
         if self.interior.pixels:
             interior, edges, table = self.interior, self.edges, self.table
             scores += [
-                Score("faces' interior rms", interior.rms, "mm", interior.coverage),
+                Score("faces' interior rms", interior.rms, "mm", interior.coverage, better="lower"),
                 *self._published("faces' interior, p99", interior.percentile(99)),
-                Score("faces' interior bias", interior.mean, "mm", interior.coverage),
+                Score(
+                    "faces' interior bias", interior.mean, "mm", interior.coverage, better="zero"
+                ),
                 Score(
                     f"within {EDGE_PX} px of an edge, p95",
                     edges.percentile(95),
                     "mm",
                     edges.coverage,
+                    better="lower",
                 ),
-                Score("table bias", table.mean, "mm", table.coverage),
+                Score("table bias", table.mean, "mm", table.coverage, better="zero"),
             ]
         if self.normals_deg:
             measured, worst = len(self.normals_deg), float(np.max(self.normals_deg))
             note = f"{measured} of {self.normal_faces} faces over {NORMAL_MIN_PX} px"
             share = measured / self.normal_faces
             scores += [
-                Score("normals, mean", float(np.mean(self.normals_deg)), "deg", share, note),
-                Score("normals, worst", worst, "deg", share, note, "7 at most"),
+                Score(
+                    "normals, mean", float(np.mean(self.normals_deg)), "deg", share, note, "lower"
+                ),
+                Score("normals, worst", worst, "deg", share, note, "lower", "7 at most"),
             ]
         if self.planes.pixels:
             planes = self.planes
             middle = f"middle {PATCH_PX}×{PATCH_PX}"
             scores += [
-                Score("planes, rms", planes.rms, "mm", planes.coverage),
-                Score(f"planes, worst in {middle}", self.worst_patch_mm, "mm", planes.coverage),
+                Score("planes, rms", planes.rms, "mm", planes.coverage, better="lower"),
+                Score(
+                    f"planes, worst in {middle}",
+                    self.worst_patch_mm,
+                    "mm",
+                    planes.coverage,
+                    better="lower",
+                ),
                 *self._published(f"planes, worst in {middle}", self.worst_patch_mm),
             ]
         return scores
@@ -281,10 +311,39 @@ class DepthScorer(Scorer):
         """An error by both readings of the paper's "3.4 % of the ranging distance"."""
         return [
             Score(
-                figure, error_mm / self.stand_off_m / 10, "% of stand-off", published="3.4, read so"
+                figure,
+                error_mm / self.stand_off_m / 10,
+                "% of stand-off",
+                better="lower",
+                published="3.4, read so",
             ),
-            Score(figure, error_mm / self.span_m / 10, "% of span", published="3.4, or so"),
+            Score(
+                figure,
+                error_mm / self.span_m / 10,
+                "% of span",
+                better="lower",
+                published="3.4, or so",
+            ),
         ]
+
+    def state(self) -> dict[str, Any]:
+        return {
+            **{name: getattr(self, name).state() for name in self._KINDS},
+            "normals_deg": self.normals_deg,
+            "normal_faces": self.normal_faces,
+            "worst_patch_mm": self.worst_patch_mm,
+            "stand_off_m": self.stand_off_m,
+            "span_m": self.span_m,
+        }
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        for name in self._KINDS:
+            getattr(self, name).take(state[name])
+        self.normals_deg += state["normals_deg"]
+        self.normal_faces += state["normal_faces"]
+        self.worst_patch_mm = float(np.fmax(self.worst_patch_mm, state["worst_patch_mm"]))
+        if math.isfinite(state["span_m"]):
+            self.stand_off_m, self.span_m = state["stand_off_m"], state["span_m"]
 
 
 def _in_range(depth_m: np.ndarray, calibration: Any) -> np.ndarray:

@@ -18,13 +18,17 @@ from stages.edges.operators import Gradient
 from stages.edges.planes import Camera, background_plane, fit_planes
 from stages.edges.stack import image_scale
 
-__all__ = ["RegionTable", "closed_regions", "distance_to_border", "region_features"]
+__all__ = [
+    "RegionTable", "closed_regions", "closed_share", "distance_to_border", "region_features",
+]  # fmt: skip
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+
+_BESIDE_PX = 5
 
 
 # -- regions -------------------------------------------------------------------------------------
@@ -472,6 +476,21 @@ def region_features(
         area[1:], p, shape, np.sqrt(far[1:]), np.column_stack([cx[1:], cy[1:]]), rim, background,
         known_share, elevation, point, normal, tilt, residual, plane_px, source,
     )  # fmt: skip
+
+
+def closed_share(labels: I32, lines: Bool) -> float:
+    """Share of the line pixels [H W] with two regions beside them; the others close nothing.
+
+    NaN without lines.  What is beside a pixel is within 2 px of it.
+    """
+    count = int(lines.sum())
+    if not count:
+        return float("nan")
+    beside = np.ones((_BESIDE_PX, _BESIDE_PX), np.uint8)
+    numbers = labels.astype(np.float32)
+    greatest = cv2.dilate(numbers, beside)
+    least = cv2.erode(np.where(labels > 0, numbers, np.float32(np.inf)), beside)
+    return int((lines & (greatest > least)).sum()) / count
 
 
 def distance_to_border(labels: I32) -> F32:

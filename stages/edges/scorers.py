@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict, astuple
 from typing import Any
 
 import numpy as np
@@ -52,9 +53,19 @@ class EdgeScorer(Scorer):
         for artifact, total in self.totals.items():
             name = self.images[artifact]
             note = f"±{TOLERANCE_PX} px of face boundaries"
-            scores.append(Score(f"{name}, precision", total.precision, note=note))
-            scores.append(Score(f"{name}, recall", total.recall, note=note))
+            scores += [
+                Score(f"{name}, precision", total.precision, note=note, better="higher"),
+                Score(f"{name}, recall", total.recall, note=note, better="higher"),
+            ]
         return scores
+
+    def state(self) -> dict[str, Any]:
+        return {artifact: astuple(total) for artifact, total in self.totals.items()}
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        for artifact, counts in state.items():
+            score, before = EdgeScore(*counts), self.totals.get(artifact)
+            self.totals[artifact] = score if before is None else before + score
 
 
 class RegionScorer(Scorer):
@@ -81,13 +92,19 @@ class RegionScorer(Scorer):
         faces = f"{total['faces']:.0f} faces over {MIN_FACE_PX} px"
         free = f"{total['uncovered']:.0f} faces that nothing covers"
         return [
-            Score(f"faces found (IoU ≥ {FOUND_IOU})", total["found"], note=faces),
-            Score("mean IoU", total["mean_iou"], note=faces),
-            Score("uncovered faces found", total["uncovered_found"], note=free),
-            Score("uncovered mean IoU", total["uncovered_mean_iou"], note=free),
-            Score("leaks", total["leaks"], "regions", note="over two faces"),
-            Score("splits", total["splits"], "faces", note="in several regions"),
+            Score(f"faces found (IoU ≥ {FOUND_IOU})", total["found"], note=faces, better="higher"),
+            Score("mean IoU", total["mean_iou"], note=faces, better="higher"),
+            Score("uncovered faces found", total["uncovered_found"], note=free, better="higher"),
+            Score("uncovered mean IoU", total["uncovered_mean_iou"], note=free, better="higher"),
+            Score("leaks", total["leaks"], "regions", note="over two faces", better="lower"),
+            Score("splits", total["splits"], "faces", note="in several regions", better="lower"),
         ]
+
+    def state(self) -> dict[str, Any]:
+        return {"frames": [asdict(frame) for frame in self.frames]}
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        self.frames += [FaceScore(**frame) for frame in state["frames"]]
 
 
 def _has_faces(truth: Any, artifact: str, artifacts: Mapping[str, Any]) -> bool:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -215,10 +215,15 @@ class RecognitionScorer(Scorer):
             return []
         of = f"of {self.frames} frames"
         scores = [
-            Score("picked part uncovered and named rightly", self.good / self.frames, note=of),
-            Score("named rightly", self.right / self.frames, note=of),
-            Score("wrong names", float(self.wrong), "frames", note=of),
-            Score("rearrange", float(self.frames - self.picks), "frames", note=of),
+            Score(
+                "picked part uncovered and named rightly",
+                self.good / self.frames,
+                note=of,
+                better="higher",
+            ),
+            Score("named rightly", self.right / self.frames, note=of, better="higher"),
+            Score("wrong names", float(self.wrong), "frames", note=of, better="lower"),
+            Score("rearrange", float(self.frames - self.picks), "frames", note=of, better="lower"),
         ]
         low = 0.0
         for k, high in enumerate((*_COVERED_BINS, 1.0)):
@@ -228,11 +233,22 @@ class RecognitionScorer(Scorer):
                         f"recognised, {100 * low:.0f} to {100 * high:.0f} % covered",
                         float(self.recognised[k] / self.surfaces[k]),
                         note=f"of {self.surfaces[k]} surfaces; {self.misnamed[k]} misnamed",
+                        better="higher",
                         published="recognised" if high <= _PUBLISHED_COVERED else "not promised",
                     )
                 )
             low = high
         return scores
+
+    def state(self) -> dict[str, Any]:
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in vars(self).items()
+        }
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        for name, count in state.items():
+            setattr(self, name, getattr(self, name) + np.array(count))
 
 
 @dataclass
@@ -248,11 +264,17 @@ class _Errors:
         self.total += error
         self.worst = max(self.worst, error)
 
+    def take(self, state: Sequence[float]) -> None:
+        count, total, worst = state
+        self.count += int(count)
+        self.total += total
+        self.worst = max(self.worst, worst)
+
     def scores(self, title: str, unit: str, note: str, share: float, published: str) -> list[Score]:
         mean = self.total / self.count
         return [
-            Score(f"{title}, mean error", mean, unit, share, note, published),
-            Score(f"{title}, worst error", self.worst, unit, share, note, published),
+            Score(f"{title}, mean error", mean, unit, share, note, "lower", published),
+            Score(f"{title}, worst error", self.worst, unit, share, note, "lower", published),
         ]
 
 
@@ -331,7 +353,9 @@ class PoseScorer(Scorer):
         scores: list[Score] = []
         if self.poses:
             note = f"of {self.poses} poses"
-            scores.append(Score("rotation left open", float(self.open), "poses", note=note))
+            scores.append(
+                Score("rotation left open", float(self.open), "poses", note=note, better="lower")
+            )
         for tilt, errors in sorted(self.rotations.by_tilt.items()):
             share, note = errors.count / self.poses, "modulo each part's period"
             published = "7.6 (2.1 % of a turn)" if tilt != "tilted farther" else "not promised"
@@ -347,6 +371,32 @@ class PoseScorer(Scorer):
             if key in self.errors:
                 scores += self.errors[key].scores(title, unit, "", 1.0, published)
         return scores
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "counts": [self.poses, self.open],
+            "period_deg": self.rotations.period_deg,
+            **{
+                kind: {name: list(astuple(errors)) for name, errors in own.items()}
+                for kind, own in self._kinds().items()
+            },
+        }
+
+    def take(self, state: Mapping[str, Any]) -> None:
+        poses, left_open = state["counts"]
+        self.poses += poses
+        self.open += left_open
+        self.rotations.period_deg.update(state["period_deg"])
+        for kind, own in self._kinds().items():
+            for name, errors in state[kind].items():
+                own.setdefault(name, _Errors()).take(errors)
+
+    def _kinds(self) -> dict[str, dict[str, _Errors]]:
+        return {
+            "by_tilt": self.rotations.by_tilt,
+            "by_part": self.rotations.by_part,
+            "errors": self.errors,
+        }
 
 
 def rotation_error_deg(

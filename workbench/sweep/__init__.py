@@ -1,0 +1,1 @@
+"""Sweeps: a grid of parameters over recordings, each distinct result computed once and kept."""
