@@ -504,3 +504,14 @@ def test_report_as_json(bench: Command, scene_file: Callable[..., Path]) -> None
     report = json.loads(ended.out)
     assert report["frames"] == 1 and report["seed"] == 0
     assert report["median_seconds_a_frame"] > 0 and report["bytes"] > 1000
+
+
+def test_the_committed_recording_says_how_it_was_made() -> None:
+    from mcap.reader import make_reader
+
+    with SCENE.with_name("simulated.mcap").open("rb") as stream:
+        records = {one.name: one.metadata for one in make_reader(stream).iter_metadata()}
+    made = records["simulation"]
+    assert made["seed"] == "7" and made["scene"] == "pile.toml"
+    assert made["scene_toml"] == (SCENES / "pile.toml").read_text(encoding="utf-8")
+    assert Rig.from_metadata(records["rig"]) == Rig(principal_point_px=(127.5, 127.5))
