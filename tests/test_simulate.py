@@ -456,6 +456,8 @@ def test_exposures_of_one_scene_differ_in_noise_only(
         (POSES, "paths = 8", "", "not TOML"),
         (POSES, "sky = -1.0", "", "sky: "),
         ("[[series]]\nkind = 'planes'\ndistances_mm = []", "", "", "distances_mm"),
+        ("[[series]]\nkind = 'planes'\ndistances_mm = {start = 1}", "", "", "_mm: stop: Field"),
+        ("[[series]]\nkind = 'pose'\nparts = []", "", "", "no frames: a series of poses needs"),
         ("[[series]]\nkind = 'planes'\ndistances_mm = [50.0]", "", "", "reaches to 50.0 mm"),
         (
             "[[series]]\nkind = 'occlusion'\nbottom = 'cuboid'\ntop = 'cuboid'\nocclusions = [1.5]",
