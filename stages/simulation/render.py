@@ -322,7 +322,7 @@ class _Tracer:
         points = np.where(seen[:, None], points.reshape(-1, 3), 1e6)
         facing = (normals * points).sum(1) > 0
         normals = np.where(facing[:, None], -normals, normals)
-        samples = _points(max(self.paths // 4, 1), 6)
+        samples = _points(4 * self.paths, 6)
         light = np.zeros((seen.size, 2))
 
         def work(pixels: np.ndarray) -> None:
