@@ -69,7 +69,7 @@ def main() -> None:
                 arguments.pictures.mkdir(exist_ok=True)
                 name = f"{frame.index:03}_{channel}.png"
                 picture = cv2.resize(both, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
-                cv2.imwrite(str(arguments.pictures / name), picture)
+                cv2.imwrite(str(arguments.pictures / name), picture.astype(np.uint8))
         near, far, flat = rms
         print(
             f"{frame.index:5} {depth:11.4f} {(~same).sum():10} {near:8.2f} {far:8.2f} {flat:8.2f}"

@@ -84,7 +84,7 @@ def test_toml_and_the_far_focus(tmp_path: Path) -> None:
         ("far_focus_mm = 800.0\nsensor_separation_mm = 1.0", "found both"),
         ("f_nummer = 2.0", "unknown key 'f_nummer'"),
         ("f_number = -1.0", "f_number: Input should be greater than 0, got -1.0"),
-        ("projector.focus_mm = 3.0", "the projector: a lens of 60 mm cannot focus at 3 mm"),
+        ("projector.focus_mm = 3.0", "projector: a lens of 60 mm cannot focus at 3 mm"),
         ("projector.pattern = 'zebra'", "projector.pattern: "),
         ("f_number = [", "not TOML"),
     ],

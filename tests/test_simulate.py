@@ -456,6 +456,8 @@ def test_exposures_of_one_scene_differ_in_noise_only(
         (POSES, "paths = 8", "", "not TOML"),
         (POSES, "sky = -1.0", "", "sky: "),
         ("[[series]]\nkind = 'planes'\ndistances_mm = []", "", "", "distances_mm"),
+        ("[[series]]\nkind = 'planes'\ndistances_mm = {start = 1}", "", "", "_mm: stop: Field"),
+        ("[[series]]\nkind = 'pose'\nparts = []", "", "", "no frames: a series of poses needs"),
         ("[[series]]\nkind = 'planes'\ndistances_mm = [50.0]", "", "", "reaches to 50.0 mm"),
         (
             "[[series]]\nkind = 'occlusion'\nbottom = 'cuboid'\ntop = 'cuboid'\nocclusions = [1.5]",
@@ -504,3 +506,14 @@ def test_report_as_json(bench: Command, scene_file: Callable[..., Path]) -> None
     report = json.loads(ended.out)
     assert report["frames"] == 1 and report["seed"] == 0
     assert report["median_seconds_a_frame"] > 0 and report["bytes"] > 1000
+
+
+def test_the_committed_recording_says_how_it_was_made() -> None:
+    from mcap.reader import make_reader
+
+    with SCENE.with_name("simulated.mcap").open("rb") as stream:
+        records = {one.name: one.metadata for one in make_reader(stream).iter_metadata()}
+    made = records["simulation"]
+    assert made["seed"] == "7" and made["scene"] == "pile.toml"
+    assert made["scene_toml"] == (SCENES / "pile.toml").read_text(encoding="utf-8")
+    assert Rig.from_metadata(records["rig"]) == Rig(principal_point_px=(127.5, 127.5))

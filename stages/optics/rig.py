@@ -63,10 +63,7 @@ class Projector(pydantic.BaseModel):
 
     @pydantic.model_validator(mode="after")
     def _can_focus(self) -> Self:
-        try:
-            image_distance_mm(self.focal_length_mm, self.focus_mm)
-        except ValueError as error:
-            raise ValueError(f"the projector: {error}") from error
+        image_distance_mm(self.focal_length_mm, self.focus_mm)
         return self
 
     @property
@@ -416,9 +413,9 @@ def mistake(error: pydantic.ValidationError) -> str:
     says = first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         return f"unknown key {where!r}"
-    if not where or first["type"] == "value_error":
-        return says
-    return f"{where}: {says}, got {first['input']!r}"
+    if first["type"] not in ("value_error", "missing"):
+        says = f"{says}, got {first['input']!r}"
+    return f"{where}: {says}" if where else says
 
 
 def _vector(text: str, origin: str) -> tuple[float, float, float]:

@@ -205,19 +205,19 @@ def _pattern(x, y, z, light, table, table_step):
 @_compiled
 def _from_elsewhere(x, y, z, own, pinhole, ambient_face, ambient, ambient_of_face):
     """Sky and bounce at a point: they change slowly, so a near pixel's of the same face do."""
-    height, width = ambient.shape
+    height, width = ambient.shape[0], ambient.shape[1]
     i = int(round(pinhole[0] * x / z + pinhole[1]))
     j = int(round(pinhole[0] * y / z + pinhole[2]))
     i = min(max(i, 0), width - 1)
     j = min(max(j, 0), height - 1)
     if ambient_face[j, i] == own:
-        return ambient[j, i]
-    value, nearest = ambient_of_face[own], 1000
+        return ambient[j, i, 0], ambient[j, i, 1]
+    value, nearest = (ambient_of_face[own, 0], ambient_of_face[own, 1]), 1000
     for jj in range(max(j - 2, 0), min(j + 3, height)):
         for ii in range(max(i - 2, 0), min(i + 3, width)):
             apart = (ii - i) ** 2 + (jj - j) ** 2
             if ambient_face[jj, ii] == own and apart < nearest:
-                nearest, value = apart, ambient[jj, ii]
+                nearest, value = apart, (ambient[jj, ii, 0], ambient[jj, ii, 1])
     return value
 
 
@@ -242,9 +242,10 @@ def gather(
 ):
     """Mean light of each pixel's rays, with the pattern and with the projector open: [2 P].
 
-    ``normals`` [T 3], ``albedo`` [T] and ``face`` [T] are by triangle; ``ambient`` [H W] is the
-    light from elsewhere by pixel of the ``pinhole`` (focal length, centre x, y) that sees
-    ``ambient_face`` [H W], and ``ambient_of_face`` [F] stands in where it does not see a face.
+    ``normals`` [T 3], ``albedo`` [T] and ``face`` [T] are by triangle; ``ambient`` [H W 2] is
+    the light from elsewhere, with the pattern and without, by pixel of the ``pinhole`` (focal
+    length, centre x, y) that sees ``ambient_face`` [H W], and ``ambient_of_face`` [F 2] stands in
+    where it does not see a face.
     """
     for p in range(rays.shape[0]):
         with_pattern, without = 0.0, 0.0
@@ -262,8 +263,8 @@ def gather(
                 direct = _irradiance(x, y, z, nx, ny, nz, light)
                 if direct > 0:
                     patterned = direct * _pattern(x, y, z, light, table, table_step)
-            with_pattern += albedo[k] * (patterned + other)
-            without += albedo[k] * (direct + other)
+            with_pattern += albedo[k] * (patterned + other[0])
+            without += albedo[k] * (direct + other[1])
         out[0, p] = with_pattern / rays.shape[1]
         out[1, p] = without / rays.shape[1]
 
@@ -388,8 +389,8 @@ def gather_plain(
                         )
             passed /= samples.shape[0]
             transmitted /= samples.shape[0]
-        out[0, p] = albedo[k] * (direct * transmitted + other * passed)
-        out[1, p] = albedo[k] * (direct + other) * passed
+        out[0, p] = albedo[k] * (direct * transmitted + other[0] * passed)
+        out[1, p] = albedo[k] * (direct + other[1]) * passed
 
 
 @_compiled
@@ -417,16 +418,22 @@ def hemisphere_rays(out, points, normals, samples, seed, pixels):
 
 
 @_compiled
-def gather_ambient(out, rays, t, triangle, shadowed, normals, albedo, light, sky, bounce):
-    """Sky and one diffuse bounce of the projector's mean light, as seen along rays: ``out`` [P]."""
+def gather_ambient(
+    out, rays, t, triangle, shadowed, normals, albedo, light, sky, bounce, pattern_mean
+):
+    """Sky and one diffuse bounce of the projector's light, as seen along rays: ``out`` [P 2].
+
+    With the pattern, of whose mean the bounce is, and with the projector open.
+    """
     for p in range(rays.shape[0]):
-        total = 0.0
+        open_sky, bounced = 0.0, 0.0
         for s in range(rays.shape[1]):
             k = triangle[p, s]
             if k < 0:
-                total += sky
+                open_sky += sky
             elif bounce > 0 and not shadowed[p, s]:
                 x, y, z = _hit(rays[p, s], t[p, s])
                 nx, ny, nz = _facing(normals[k], rays[p, s])
-                total += bounce * albedo[k] * _irradiance(x, y, z, nx, ny, nz, light)
-        out[p] = total / rays.shape[1]
+                bounced += bounce * albedo[k] * _irradiance(x, y, z, nx, ny, nz, light)
+        out[p, 0] = (open_sky + pattern_mean * bounced) / rays.shape[1]
+        out[p, 1] = (open_sky + bounced) / rays.shape[1]

@@ -311,7 +311,10 @@ class _Tracer:
 
     @cached_property
     def _ambient(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Face (-1: not known), light from elsewhere [H W], and that light's mean by face [F]."""
+        """Face (-1: not known) [H W], light from elsewhere [H W 2], and its mean by face [F 2].
+
+        The two are with the pattern and with the projector open.
+        """
         _, triangle, points = self._pinhole
         shape = triangle.shape
         seen = triangle.ravel() >= 0
@@ -319,8 +322,8 @@ class _Tracer:
         points = np.where(seen[:, None], points.reshape(-1, 3), 1e6)
         facing = (normals * points).sum(1) > 0
         normals = np.where(facing[:, None], -normals, normals)
-        samples = _points(max(self.paths // 4, 1), 6)
-        light = np.empty(seen.size)
+        samples = _points(4 * self.paths, 6)
+        light = np.zeros((seen.size, 2))
 
         def work(pixels: np.ndarray) -> None:
             bundle = np.empty((len(pixels), len(samples), 6), np.float32)
@@ -329,7 +332,7 @@ class _Tracer:
             )
             t, hit = self._cast(bundle)
             shadowed = self._shadow(bundle, t, hit, pixels)
-            gathered = np.empty(len(pixels))
+            gathered = np.empty((len(pixels), 2))
             rays.gather_ambient(
                 gathered,
                 bundle,
@@ -340,7 +343,8 @@ class _Tracer:
                 self._albedo,
                 self._light,
                 self.lighting.sky,
-                self.lighting.bounce * pattern_mean(self._projector.pattern),
+                self.lighting.bounce,
+                pattern_mean(self._projector.pattern),
             )
             light[pixels] = gathered
 
@@ -354,9 +358,12 @@ class _Tracer:
         faces = np.where(sampled, faces, -1).astype(np.int32)
         known = faces >= 0
         counts = np.bincount(faces[known], minlength=self._face_count)
-        sums = np.bincount(faces[known], light[known], minlength=self._face_count)
-        means = np.where(counts > 0, sums / np.maximum(counts, 1), self.lighting.sky / 2)
-        return faces.reshape(shape), light.reshape(shape), means
+        sums = np.stack(
+            [np.bincount(faces[known], of[known], minlength=self._face_count) for of in light.T], 1
+        )
+        few = np.full_like(sums, self.lighting.sky / 2)
+        means = np.divide(sums, counts[:, None], out=few, where=counts[:, None] > 0)
+        return faces.reshape(shape), light.reshape(*shape, 2), means
 
     def _image(self, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
         """A sensor's light with the pattern and with the projector open, each [H W]."""

@@ -397,13 +397,13 @@ class SceneFile(pydantic.BaseModel):
         try:
             return Rig.model_validate(rig)
         except pydantic.ValidationError as error:
-            raise ValueError(f"rig: {mistake(error)}") from error
+            raise ValueError(mistake(error)) from error
 
     @pydantic.field_validator("paths")
     @classmethod
     def _power_of_two(cls, paths: int) -> int:
         if paths & (paths - 1):
-            raise ValueError(f"paths: expected a power of two, found {paths}")
+            raise ValueError(f"expected a power of two, found {paths}")
         return paths
 
 
@@ -452,6 +452,8 @@ class Scene:
             meshes = {name: load_mesh(path.parent / file) for name, file in values.parts.items()}
             around = Surroundings(rig, values.table, meshes)
             makers = [maker for series in values.series for maker in series.makers(around)]
+            if not makers:
+                raise DataError("no frames: a series of poses needs parts, found none in [parts]")
         except (ValueError, DataError) as error:
             raise DataError(f"{path}: {error}") from error
         return cls(path, text, values, rig, makers)
