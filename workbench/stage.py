@@ -211,11 +211,24 @@ def knob(
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence of a pixel's story: a value, the threshold that it met, and what followed."""
+    """One sentence of a pixel's story: a value, the threshold that it met, and what followed.
+
+    ``values`` are the numbers of the sentence, exactly as they are: a key that is an artifact with
+    axes ``H W`` holds that artifact's value at the pixel, so that a reader can check the sentence.
+    ``parameter`` is the knob of the same stage that the value was held against, or that decided.
+
+    ``verdict`` is the state that the pixel is in from here on, in a word or two without numbers
+    (``"edge"``, ``"no edge"``): a stage's verdict is its last finding's that has one.  A changed
+    verdict is what ``workbench why`` looks for, so two pixels that fare alike have the same.
+    ``about`` says what the verdict is on where that is not this very pixel, such as the region
+    beside a line: what is asked of a pixel is the last verdict on the pixel itself.
+    """
 
     says: str
     values: Mapping[str, Any] = field(default_factory=dict)
     parameter: str | None = None
+    verdict: str = ""
+    about: str = ""
 
 
 @dataclass(frozen=True)
@@ -315,7 +328,11 @@ class Stage:
         return ()
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> Sequence[Finding]:
-        """The story of pixel (x, y) in this stage."""
+        """The story of pixel (x, y) in this stage, in order: values, thresholds, verdict, reason.
+
+        ``artifacts`` is everything known of the frame and ``p`` the stage's own ``Parameters``.
+        What is told agrees with the artifacts to the last digit that is printed.
+        """
         return ()
 
     def histograms(self, artifacts: Mapping[str, Any], p: Any) -> Sequence[Histogram]:
