@@ -59,6 +59,8 @@ class Artifact:
     unit: str = ""
     doc: str = ""
     required: bool = True
+    names_regions: bool = field(default=False, kw_only=True)
+    """Whether its integers only name regions, so that renumbering them changes nothing."""
 
     def optional(self) -> Self:
         """The same artifact as a need that may be absent (its value is then None)."""
