@@ -7,6 +7,7 @@ While the worker is busy only the newest wish is kept, so that nothing queues.
 
 from __future__ import annotations
 
+import copy
 import json
 import threading
 import time
@@ -16,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, get_args
 
 from workbench.errors import DataError, UsageError, one_line
-from workbench.pipeline import Pipeline, Run
+from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.recording import Frame
 from workbench.settings import (
     Settings,
@@ -29,6 +30,7 @@ from workbench.settings import (
 )
 from workbench.stage import Histogram, Knob, Stage
 from workbench.tune.frames import FrameSource
+from workbench.why import Search, Story, smallest_change, story
 
 View = Literal["live", "A", "B", "beside", "difference"]
 VIEWS: tuple[View, ...] = get_args(View)
@@ -36,6 +38,7 @@ PINS = ("A", "B")
 
 _HISTORY = 500
 _KEPT_SCORES = 256
+_SEARCH_BYTES = 64 << 20
 _PATIENCE_S = 0.15
 """How long a recompute that is no longer the newest may go on: a short one is finished, so that
 what is downstream follows a drag; a long one is left for the newer."""
@@ -183,6 +186,7 @@ class LiveBench:
         self._before = ("at start", pipeline.settings)
         self._wish: _Wish | None = None
         self._mark: tuple[int, int] | None = None
+        self._under: dict[str, tuple[Settings, Run]] = {}
         self._busy = False
         self._closing = False
         self._shown = Snapshot(0, pipeline.settings, 0, "live", "", {}, False, False, False)
@@ -403,6 +407,61 @@ class LiveBench:
         with self._lock:
             return None if self._shown.run is None else self._shown.run.frame.index
 
+    # -- asking about a pixel -----------------------------------------------------------------------
+
+    def story(self, x: int, y: int, layer: str = "") -> Story:
+        """What every stage tells of pixel (x, y) of the run that is shown under ``layer``.
+
+        Raises :class:`UsageError` where nothing is shown yet, or the pixel lies outside.
+        """
+        pipeline, run = self._shown_under(layer)
+        return story(pipeline, run, x, y)
+
+    def smallest_change(
+        self, x: int, y: int, layer: str = "", before_each: Callable[[], None] = lambda: None
+    ) -> Search | None:
+        """The least change of one parameter that turns the verdict on pixel (x, y).
+
+        Takes up to seconds and runs beside the worker, with results of its own; ``before_each``
+        may raise to stop it.
+        """
+        pipeline, run = self._shown_under(layer)
+        apart = copy.copy(pipeline)
+        apart.store = ResultStore(_SEARCH_BYTES)
+        return smallest_change(apart, run, x, y, before_each=before_each)
+
+    def _shown_under(self, layer: str) -> tuple[Pipeline, Run]:
+        with self._lock:
+            found = self._under.get(layer)
+            if found is None:
+                found = (self._shown.run_settings, self._shown.run)
+        settings, run = found
+        if settings is None or run is None:
+            raise UsageError("nothing is shown yet")
+        return self.pipeline.with_settings(settings), run
+
+    # -- dragging a threshold ---------------------------------------------------------------------
+
+    def drag(
+        self, stage: str, histogram: int, cut: int, place: float, settled: bool = True
+    ) -> None:
+        """Bring a threshold of a histogram to a place on its axis, as near as its knob lets it.
+
+        Raises :class:`UsageError` where there is no such threshold, or it only follows others.
+        """
+        found = self.histograms(stage) if stage in self.stages else ()
+        if not 0 <= histogram < len(found) or not 0 <= cut < len(found[histogram].cuts):
+            raise UsageError(f"{stage}: no such threshold")
+        line = found[histogram].cuts[cut]
+        knob = None if line.parameter is None else self.knobs(stage).get(line.parameter)
+        if knob is None:
+            raise UsageError(f"{stage}: the threshold {line.name!r} follows from others")
+        value = place if line.setting is None else line.setting(place)
+        value = min(value, value if knob.high is None else knob.high)
+        value = max(value, value if knob.low is None else knob.low)
+        value = round(value) if knob.kind == "int" else float(f"{value:.6g}")
+        self.set({f"{stage}.{knob.name}": value}, settled)
+
     # -- the page's address -----------------------------------------------------------------------
 
     def query(self) -> dict[str, list[str]]:
@@ -583,6 +642,9 @@ class LiveBench:
         with self._lock:
             label, before = self._before
             # The scores take their time: what was found is told before them.
+            self._under = {
+                part.prefix: (part.settings, runs[part.prefix]) for part in picture.parts
+            }
             self._shown = replace(
                 self._shown,
                 run=live,
