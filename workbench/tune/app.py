@@ -15,6 +15,8 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
+import rerun as rr
+
 from workbench.tune.canvas import Canvas, live_recording
 from workbench.tune.live import LiveBench
 from workbench.tune.page import PageOptions, mount
@@ -34,7 +36,7 @@ class LivePage:
         self.token = new_token()
         self.hub = Hub(on_join=bench.redraw)
         self._recording = live_recording(secrets.token_hex(8))
-        self._stream = self._recording.binary_stream()
+        self._stream = rr.binary_stream(self._recording)
         self.canvas = Canvas(bench.pipeline, self._recording, self._flush, self._renew)
         bench.display = self.canvas
         self._options = replace(options, viewer_version=version("rerun-sdk"))
@@ -69,4 +71,4 @@ class LivePage:
 
     def _renew(self) -> None:
         # A new sink begins with what tells a viewer which recording it is.
-        self._stream = self._recording.binary_stream()
+        self._stream = rr.binary_stream(self._recording)

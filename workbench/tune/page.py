@@ -25,7 +25,7 @@ from workbench.report import write_beside
 from workbench.stage import Histogram, Knob
 from workbench.tune.canvas import Canvas
 from workbench.tune.live import LiveBench, Snapshot
-from workbench.why import Change, Story
+from workbench.why import Story
 
 _DRAG_SECONDS = 0.04
 _PLAY_SECONDS = 0.25
@@ -104,7 +104,7 @@ class _Page:
         ui.keyboard(on_key=self._key, ignore=["input", "textarea"])
         ui.on("viewer_selection", self._clicked)
         self._client.on_delete(self.bench.subscribe(self._changed))
-        self._client.on_connect(lambda: self._client and self._start_viewer(version))
+        self._client.on_connect(lambda: self._start_viewer(version))
         if query:
             self._tried(lambda: self.bench.restore(query))
         self._refresh()
@@ -345,7 +345,7 @@ class _Page:
             else:
                 self._offer(search.change, search.runs)
 
-    def _offer(self, change: Change, runs: int) -> None:
+    def _offer(self, change: Any, runs: int) -> None:
         ui.label("The smallest change that turns it").classes("change-title")
         before, after = _short(change.before), _short(change.after)
         ui.label(f"{change.address}").classes("mono")

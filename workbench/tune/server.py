@@ -210,8 +210,8 @@ def application(hub: Hub, viewer_files: Path) -> FastAPI:
     """The routes beside the page: Rerun's viewer, the page's script, and the stream."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
-    @app.get("/viewer/{version}/{name}")
-    def viewer_file(version: str, name: str) -> Response:
+    @app.get("/viewer/{_version}/{name}")
+    def viewer_file(_version: str, name: str) -> Response:
         types = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "application/wasm"}
         if name not in types:
             return PlainTextResponse("no such file\n", status_code=404)

@@ -49,7 +49,7 @@ window.bench = (() => {
         hide_welcome_screen: true,
         persist: false,
         panel_state_overrides: {
-          top: "hidden", blueprint: "hidden", selection: "hidden", time: "hidden",
+          top: "Hidden", blueprint: "Hidden", selection: "Hidden", time: "Hidden",
         },
         on_viewer_event: (text) => {
           const event = typeof text === "string" ? JSON.parse(text) : text;
