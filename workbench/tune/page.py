@@ -90,7 +90,8 @@ class _Page:
         ui.colors(primary="#4a9eff", dark="#0d1011", dark_page="#0d1011", accent="#ff8a3d")
         version = self.options.viewer_version
         ui.add_head_html(
-            f'<script src="/viewer/{version}/re_viewer.js"></script><script src="/tune.js"></script>'
+            f'<script src="/viewer/{version}/re_viewer.js"></script>'
+            '<script src="/tune.js"></script>'
         )
         ui.query(".nicegui-content").classes("page")
         with ui.element("div").classes("bar"):
@@ -486,6 +487,9 @@ class _StagePanel:
             return
         self.drawn = run
         histograms = self.page.bench.histograms(self.name)
+        if not histograms and self.charts:
+            # A stage that fails for now keeps the lines by which it was brought there.
+            return
         if len(histograms) != len(self.charts):
             self.chart_box.clear()
             with self.chart_box:

@@ -52,7 +52,7 @@ class Guard:
             await self._enter(scope, query)(scope, receive, send)
             return
         if scope["type"] == "http":
-            receive = _bounded(receive)
+            receive, send = _bounded(receive), _confined(send)
         try:
             await self._app(scope, receive, send)
         except _TooLarge:
@@ -116,6 +116,31 @@ def _bounded(receive: Receive) -> Receive:
         return message
 
     return counted
+
+
+_POLICY = "; ".join(
+    (
+        "default-src 'self' data: blob:",
+        "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:",
+        "style-src 'self' 'unsafe-inline'",
+        "frame-ancestors 'none'",
+    )
+)
+"""The page may talk to this server alone: neither the viewer nor a widget calls out."""
+
+
+def _confined(send: Send) -> Send:
+    async def with_policy(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [
+                *message.get("headers", ()),
+                (b"content-security-policy", _POLICY.encode()),
+                (b"referrer-policy", b"no-referrer"),
+                (b"x-content-type-options", b"nosniff"),
+            ]
+        await send(message)
+
+    return with_policy
 
 
 class _Client:
