@@ -462,7 +462,7 @@ def test_the_thresholds_of_the_edge_stack_go_where_they_are_dragged(scene: Path)
     def where(name: str) -> float:
         return bench.histograms("edge_stack")[0].cuts[names.index(name)].value
 
-    for name, place in (("low", 3.0), ("low", 6.0), ("greatest", 30.0), ("search from", 2.5)):
+    for name, place in (("low", 3.0), ("low", 6.0), ("greatest", 30.0), ("from", 2.5)):
         bench.drag("edge_stack", 0, names.index(name), place)
         assert bench.wait(60)
         # The low threshold can lie only where the ratio falls under all before.

@@ -51,12 +51,14 @@ class Guard:
         if scope["type"] == "http" and "token" in query:
             await self._enter(scope, query)(scope, receive, send)
             return
-        if scope["type"] == "http":
-            receive, send = _bounded(receive), _confined(send)
-        try:
+        if scope["type"] == "websocket":
             await self._app(scope, receive, send)
+            return
+        exchange = _Exchange(scope, receive, send)
+        try:
+            await self._app(scope, exchange.receive, exchange.send)
         except _TooLarge:
-            await self._refuse(scope, receive, send, 413, _TOO_LARGE)
+            return
 
     def _refusal(self, headers: dict[str, str], scope: Scope) -> tuple[int, str] | None:
         host, origin = headers.get("host", ""), headers.get("origin")
@@ -104,20 +106,6 @@ class _TooLarge(Exception):  # noqa: N818
     """More came than was announced, or than is taken."""
 
 
-def _bounded(receive: Receive) -> Receive:
-    taken = 0
-
-    async def counted() -> Message:
-        nonlocal taken
-        message = await receive()
-        taken += len(message.get("body", b""))
-        if taken > MAX_BODY_BYTES:
-            raise _TooLarge
-        return message
-
-    return counted
-
-
 _POLICY = "; ".join(
     (
         "default-src 'self' data: blob:",
@@ -129,8 +117,28 @@ _POLICY = "; ".join(
 """The page may talk to this server alone: neither the viewer nor a widget calls out."""
 
 
-def _confined(send: Send) -> Send:
-    async def with_policy(message: Message) -> None:
+class _Exchange:
+    """One request and its answer: a bounded body, and an answer that keeps the page confined."""
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._scope, self._receive, self._send = scope, receive, send
+        self._taken = 0
+        self._refused = False
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self._taken += len(message.get("body", b""))
+        if self._taken > MAX_BODY_BYTES:
+            # Answered here: an application takes what is raised below it for its own failure.
+            answer = PlainTextResponse(f"refused: {_TOO_LARGE}\n", status_code=413)
+            await answer(self._scope, self._receive, self._send)
+            self._refused = True
+            raise _TooLarge
+        return message
+
+    async def send(self, message: Message) -> None:
+        if self._refused:
+            return
         if message["type"] == "http.response.start":
             message["headers"] = [
                 *message.get("headers", ()),
@@ -138,9 +146,7 @@ def _confined(send: Send) -> Send:
                 (b"referrer-policy", b"no-referrer"),
                 (b"x-content-type-options", b"nosniff"),
             ]
-        await send(message)
-
-    return with_policy
+        await self._send(message)
 
 
 class _Client:

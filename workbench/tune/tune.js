@@ -99,7 +99,7 @@ window.bench = (() => {
             },
             label: {
               formatter: `${cut.name} ${cut.value.toPrecision(3)}`, color: "#e6e8ec", fontSize: 10,
-              position: "end", distance: [0, -4 - 12 * (k % 2)],
+              position: "end", distance: [0, 2 + 11 * (k % 2)],
             },
           })),
         },
@@ -126,7 +126,8 @@ window.bench = (() => {
       if (state.held === null) return;
       const value = (x) => chart.convertFromPixel({ xAxisIndex: 0 }, x);
       state.from = { x: event.offsetX, value: state.cuts[state.held].value,
-        each: value(event.offsetX + 1) - value(event.offsetX) };
+        each: value(event.offsetX + 1) - value(event.offsetX),
+        times: value(event.offsetX + 1) / value(event.offsetX) };
     });
     canvas.on("mousemove", (event) => {
       if (state.held === null) {
@@ -134,8 +135,10 @@ window.bench = (() => {
         return;
       }
       canvas.setCursorStyle("ew-resize");
-      state.cuts[state.held].value = state.from.value
-        + (event.offsetX - state.from.x) * state.from.each;
+      const moved = event.offsetX - state.from.x;
+      state.cuts[state.held].value = chart.getOption().xAxis[0].type === "log"
+        ? state.from.value * state.from.times ** moved
+        : state.from.value + moved * state.from.each;
       draw();
       const now = performance.now();
       if (now - state.told > 40) { state.told = now; tell(false); }
