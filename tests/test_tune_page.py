@@ -75,8 +75,7 @@ def host(tmp_path: Path, twins: dict[str, Path]) -> Iterator[Host]:
         target.write_bytes(file.read_bytes())
     artifacts = tmp_path / "live.npz"
     child = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("tune_host.py"))]
-        + [str(recording), str(artifacts)],
+        [sys.executable, Path(__file__).with_name("tune_host.py"), recording, artifacts],
         stdout=subprocess.PIPE,
         text=True,
         cwd=tmp_path,

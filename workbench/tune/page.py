@@ -550,7 +550,6 @@ class _KnobRow:
                     on_click=lambda: page._tried(lambda: page.bench.reset(self.address)),
                 )
                 self.reset.props("dense flat round size=xs").classes("knob-reset")
-                self.reset
                 ui.element("div").classes("grow")
                 if knob.kind == "bool":
                     self.switch = ui.switch().props("dense size=sm")
@@ -570,7 +569,6 @@ class _KnobRow:
                     )
                 else:
                     self.number = ui.input().props("dense outlined").classes("number")
-                    self.number
                     self.number.on("keydown.enter", self._typed)
                     self.number.on("blur", self._typed)
             if knob.kind in ("int", "float") and knob.low is not None and knob.high is not None:
