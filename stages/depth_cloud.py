@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from stages.artifacts import (
@@ -124,63 +125,21 @@ class DepthCloud(Stage):
     presets = {"paper": {"edge_aware": False, "smoothing_periods": 0.2, "min_confidence": 0.1}}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        import cv2
         import numpy as np
 
         from stages.dfd import depth as dfd
-        from stages.dfd.focus import SensorNoise
-        from stages.dfd.stripes import whole_period_taps
 
-        calibration, stripes = inputs["calibration"], inputs["stripes"]
-        near, far = inputs["near"], inputs["far"]
-        period_px = stripes.extent_px() if stripes is not None else _WINDOW_WITHOUT_STRIPES_PX
-        windows = dfd.windows_for(period_px, parameters.smoothing_periods, parameters.reach_periods)
-        taps = whole_period_taps(min(period_px, *near.shape))
-        brightness = cv2.sepFilter2D(
-            near + far, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
-        )
-        if calibration is not None:
-            response = dfd.Response(
-                calibration.curve,
-                calibration.modulation,
-                calibration.slope,
-                calibration.noise,
-                calibration.laplacian,
-            )
-        else:
-            response = dfd.Response(dfd.NOMINAL_CURVE, None, 0.5, SensorNoise(), "opencv")
-        relative, error_percent = dfd.estimate(
-            inputs["focus_near"],
-            inputs["focus_far"],
-            brightness,
-            inputs["intensity"],
-            response,
-            windows,
-            parameters.edge_aware,
-        )
-        confidence = dfd.confidence_from_error(
-            error_percent, parameters.half_confidence_error_percent
-        )
-        if inputs["saturated"].any():
-            share = cv2.blur(
-                inputs["saturated"].astype(np.float32), (windows.scatter_px, windows.scatter_px)
-            )
-            confidence[share > _SATURATED_SHARE] = 0
-        margin = parameters.range_margin_percent / 100
-        unknown = (
-            (confidence < parameters.min_confidence)
-            | (confidence <= 0)
-            | (relative < -margin)
-            | (relative > 1 + margin)
-        )
-        relative[unknown] = np.nan
+        calibration = inputs["calibration"]
+        measured = _measure(inputs, parameters)
+        windows, relative, confidence = measured.windows, measured.relative, measured.confidence
+        relative[_unsure(measured, parameters)] = np.nan
         if calibration is not None:
             folded = dfd.folded_back(
                 inputs["focus_near"] + inputs["focus_far"],
-                brightness,
+                measured.brightness,
                 relative,
                 calibration.modulation,
-                period_px,
+                measured.period_px,
                 parameters.min_modulation,
             )
             relative[folded] = np.nan
@@ -321,16 +280,106 @@ class DepthCloud(Stage):
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
         import numpy as np
 
-        confidence = float(artifacts["confidence"][y, x])
-        z = float(artifacts["depth_m"][y, x])
-        values = {"confidence": confidence, "depth_m": z}
-        if np.isfinite(z):
-            says = f"depth {1e3 * z:.2f} mm, confidence {confidence:.2f}"
-        elif confidence < p.min_confidence:
-            says = f"unknown: confidence {confidence:.2f} is under {p.min_confidence:g}"
-        else:
-            says = "unknown: outside the range in which depth is unique"
-        return [Finding(says, values, "min_confidence")]
+        from stages.dfd import depth as dfd
+        from stages.wording import apart
+
+        calibration = artifacts.get("calibration")
+        # What was unknown is NaN in the artifacts: its values are measured again.
+        measured = _measure({need.name: artifacts.get(need.name) for need in self.needs}, p)
+        relative, confidence = measured.relative[y, x], measured.confidence[y, x]
+        error = measured.error_percent[y, x]
+        trust = dfd.confidence_from_error(
+            measured.error_percent[y : y + 1, x : x + 1], p.half_confidence_error_percent
+        )[0, 0]
+        given = {
+            "depth_m": artifacts["depth_m"][y, x],
+            "depth_relative": artifacts["depth_relative"][y, x],
+            "confidence": artifacts["confidence"][y, x],
+        }
+        own = "windows on its own surface" if p.edge_aware else "one window"
+        findings = [
+            Finding(
+                f"the ratio of the focus maps over {own} gives relative depth {relative:.3f} "
+                "(0 near, 1 far)",
+                {"relative_measured": relative},
+                "edge_aware",
+            ),
+            Finding(
+                f"predicted error {error:.2f} % of the working range: confidence {trust:.3f}",
+                {"error_percent": error},
+                "half_confidence_error_percent",
+            ),
+        ]
+        share = measured.saturated_share
+        if share is not None and share[y, x] > 0:
+            over = share[y, x] > _SATURATED_SHARE
+            findings.append(
+                Finding(
+                    f"{100 * share[y, x]:.1f} % of the window is saturated, "
+                    + ("over" if over else "not over")
+                    + f" {100 * _SATURATED_SHARE:g} %"
+                    + (": confidence 0" if over else ""),
+                    {"saturated_share": share[y, x]},
+                )
+            )
+        low = bool(confidence < p.min_confidence or confidence <= 0)
+        findings.append(
+            Finding(
+                f"confidence {apart(confidence, p.min_confidence, 3)} is "
+                f"{'under' if low else 'not under'} "
+                f"{p.min_confidence:g}",
+                given if low else {},
+                "min_confidence",
+                "unknown" if low else "",
+            )
+        )
+        margin = p.range_margin_percent / 100
+        outside = bool(relative < -margin or relative > 1 + margin)
+        end = -margin if relative < 0.5 else 1 + margin
+        findings.append(
+            Finding(
+                f"relative depth {apart(relative, end, 3)} lies "
+                f"{'outside' if outside else 'within'} "
+                f"{-margin:.3f} to {1 + margin:.3f}",
+                given if outside else {},
+                "range_margin_percent",
+                "unknown" if outside else "",
+            )
+        )
+        folded = False
+        if calibration is not None:
+            kept = measured.relative.copy()
+            kept[_unsure(measured, p)] = np.nan
+            cells = dfd.contrast_of_cells(
+                artifacts["focus_near"] + artifacts["focus_far"],
+                measured.brightness,
+                kept,
+                calibration.modulation,
+                measured.period_px,
+            )
+            shown, enough = (dfd.on_pixels(cell, kept.shape)[y, x] for cell in cells)
+            folded = bool(shown < np.float32(p.min_modulation) * enough)
+            if enough > 0:
+                contrast = shown / enough
+                findings.append(
+                    Finding(
+                        f"the stripes around show {apart(contrast, p.min_modulation, 3)} of the "
+                        "calibrated contrast, "
+                        + ("under" if folded else "not under")
+                        + f" {p.min_modulation:g}"
+                        + (": beyond the focal planes, confidence is given as 0" if folded else ""),
+                        {"modulation_share": contrast, **(given if folded else {})},
+                        "min_modulation",
+                        "unknown" if folded else "",
+                    )
+                )
+        if low or outside or folded:
+            return findings
+        if calibration is None:
+            says = f"relative depth {relative:.3f}; there are no metres without a calibration"
+            return [*findings, Finding(says, given, None, "relative")]
+        says = f"depth {1e3 * given['depth_m']:.2f} mm with confidence {given['confidence']:.3f}"
+        return [*findings, Finding(says, given, None, "known")]
 
     def histograms(self, artifacts: Mapping[str, Any], p: Any) -> list[Histogram]:
         import numpy as np
@@ -343,6 +392,80 @@ class DepthCloud(Stage):
         from stages.dfd.score import DepthScorer
 
         return DepthScorer()
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Depth before it is decided where it is known.
+
+    ``relative``, ``error_percent``, ``confidence`` and ``brightness`` (the sum of near and far) are
+    float32 [H W]; so is ``saturated_share``, of a neighbourhood, or None where nothing saturates.
+    """
+
+    relative: Any
+    error_percent: Any
+    confidence: Any
+    brightness: Any
+    saturated_share: Any
+    windows: Any
+    period_px: float
+
+
+def _unsure(measured: _Measured, parameters: Any) -> Any:
+    """Where confidence is too low or depth lies outside the calibrated range, bool [H W]."""
+    margin = parameters.range_margin_percent / 100
+    return (
+        (measured.confidence < parameters.min_confidence)
+        | (measured.confidence <= 0)
+        | (measured.relative < -margin)
+        | (measured.relative > 1 + margin)
+    )
+
+
+def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
+    """Relative depth and its confidence at every pixel."""
+    import cv2
+    import numpy as np
+
+    from stages.dfd import depth as dfd
+    from stages.dfd.focus import SensorNoise
+    from stages.dfd.stripes import whole_period_taps
+
+    calibration, stripes = inputs["calibration"], inputs["stripes"]
+    near, far = inputs["near"], inputs["far"]
+    period_px = stripes.extent_px() if stripes is not None else _WINDOW_WITHOUT_STRIPES_PX
+    windows = dfd.windows_for(period_px, parameters.smoothing_periods, parameters.reach_periods)
+    taps = whole_period_taps(min(period_px, *near.shape))
+    brightness = cv2.sepFilter2D(
+        near + far, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT_101
+    )
+    if calibration is not None:
+        response = dfd.Response(
+            calibration.curve,
+            calibration.modulation,
+            calibration.slope,
+            calibration.noise,
+            calibration.laplacian,
+        )
+    else:
+        response = dfd.Response(dfd.NOMINAL_CURVE, None, 0.5, SensorNoise(), "opencv")
+    relative, error_percent = dfd.estimate(
+        inputs["focus_near"],
+        inputs["focus_far"],
+        brightness,
+        inputs["intensity"],
+        response,
+        windows,
+        parameters.edge_aware,
+    )
+    confidence = dfd.confidence_from_error(error_percent, parameters.half_confidence_error_percent)
+    share = None
+    if inputs["saturated"].any():
+        share = cv2.blur(
+            inputs["saturated"].astype(np.float32), (windows.scatter_px, windows.scatter_px)
+        )
+        confidence[share > _SATURATED_SHARE] = 0
+    return _Measured(relative, error_percent, confidence, brightness, share, windows, period_px)
 
 
 def _frustum_m(points: Any) -> float:

@@ -199,18 +199,77 @@ class EdgeStackStage(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        stack = artifacts["edge_choice"].stack
-        strength = float(stack.strength[y, x])
-        peak = float(stack.segment_peak[y, x])
-        low, high = stack.low_threshold, stack.high_thresholds[0]
-        values = {"strength": strength, "low": low, "high": high, "segment_peak": peak}
-        if not artifacts["edge_choice"].gradient.thin[y, x]:
-            says = f"gradient {strength:.1f} is no maximum across its edge"
-        elif strength < low:
-            says = f"gradient {strength:.1f} is under low {low:.1f}"
+        from stages.wording import apart
+
+        chosen = artifacts["edge_choice"]
+        stack = chosen.stack
+        gradient, strength = chosen.gradient.magnitude[y, x], stack.strength[y, x]
+        unit = "σ" if p.noise_units else "grey levels"
+        images = {
+            name: bool(artifacts[name][y, x])
+            for name in ("edges_low", "edges_medium", "edges_high")
+        }
+        values = {"gradient": gradient, "strength": strength}
+        measured = f"gradient {gradient:.2f} grey levels"
+        if chosen.noise is not None:
+            measured += f", {gradient / chosen.noise[y, x]:.2f} σ of the noise there"
+        if chosen.depth is not None:
+            measured += f", with the depth's evidence {strength:.2f} {unit}"
+        findings = [
+            Finding(measured, values, "noise_units" if chosen.depth is None else "depth_gain")
+        ]
+        if not chosen.gradient.thin[y, x]:
+            if strength < p.lowest:
+                says = (
+                    f"strength {apart(strength, p.lowest, 2)} is under {p.lowest:g} {unit}, too "
+                    "faint to look at"
+                )
+                return [*findings, Finding(says, images, "lowest", "no edge")]
+            says = "the gradient is no maximum across its edge: a stronger pixel is beside it"
+            return [*findings, Finding(says, images, "operator", "no edge")]
+        low = stack.low_threshold
+        kept = "keeps" if stack.upheld else "comes nearest to keeping"
+        how = f"the least threshold that {kept} small segments under {p.max_ratio:g} of large ones"
+        if strength < low:
+            says = f"strength {apart(strength, low, 2)} is under low {low:.2f} {unit}, {how}"
+            values = {**images, "low_threshold": low}
+            return [*findings, Finding(says, values, "max_ratio", "no edge")]
+        findings.append(
+            Finding(
+                f"strength {apart(strength, low, 2)} is not under low {low:.2f} {unit}, {how}",
+                {"low_threshold": low},
+                "max_ratio",
+            )
+        )
+        peak = stack.segment_peak[y, x]
+        coarse, medium, _ = stack.high_thresholds
+        if stack.edges_low[y, x]:
+            reaches, into = f"not under high {coarse:.2f}", "low, medium and high"
+        elif stack.edges_medium[y, x]:
+            reaches = f"not under medium {medium:.2f} and under high {coarse:.2f}"
+            into = "medium and high"
         else:
-            says = f"gradient {strength:.1f} is over low {low:.1f}; its segment reaches {peak:.1f}"
-        return [Finding(says, values, "max_ratio")]
+            reaches, into = f"under medium {medium:.2f}", "high"
+        nearest = min((medium, coarse), key=lambda limit: abs(limit - peak))
+        says = (
+            f"its segment's strongest pixel, {apart(peak, nearest, 2)} {unit}, is {reaches}: in "
+            f"the image of {into} resolution"
+        )
+        values = {**images, "segment_peak": peak, "medium": medium, "high": coarse}
+        if not chosen.background[y, x]:
+            return [*findings, Finding(says, values, "greatest", "edge")]
+        bright = chosen.gradient.bright[y, x]
+        return [
+            *findings,
+            Finding(says, {}, "greatest"),
+            Finding(
+                f"its brighter side, {bright:.1f} grey levels, is no brighter than what the depth "
+                "cannot see, or it is a crumb of such a line: a shadow perhaps, no edge",
+                {**images, "bright": bright},
+                "background_factor",
+                "line on the background",
+            ),
+        ]
 
     def histograms(self, artifacts: Mapping[str, Any], p: Any) -> list[Histogram]:
         import numpy as np

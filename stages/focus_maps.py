@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from stages.artifacts import CALIBRATION, FAR, FOCUS_FAR, FOCUS_NEAR, NEAR, STRIPES
@@ -107,18 +108,32 @@ class FocusMaps(Stage):
             )
         ]
 
-    def explain(self, x: int, y: int, artifacts: Any, p: Any) -> list[Finding]:
-        near = float(artifacts["focus_near"][y, x])
-        far = float(artifacts["focus_far"][y, x])
-        ratio = (near - far) / (near + far) if near + far > 0 else 0.0
-        sharper = "near" if ratio > 0 else "far"
-        return [
+    def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        stripes = artifacts.get("stripes")
+        side = window_side_px(stripes, p)
+        near, far = float(artifacts["focus_near"][y, x]), float(artifacts["focus_far"][y, x])
+        values = {"focus_near": near, "focus_far": far}
+        findings = [
             Finding(
-                f"focus near {near:.2f}, far {far:.2f}: ratio {ratio:+.3f}, sharper in {sharper}",
-                {"focus_near": near, "focus_far": far, "ratio": ratio},
-                "window_periods",
+                f"over {side:.1f} px the Laplacian has {near:.2f} grey levels in near and "
+                f"{far:.2f} in far",
+                values,
+                "window_px" if stripes is None else "window_periods",
             )
         ]
+        if near + far == 0:
+            rest = " but what the sensor's noise gives" if p.subtract_noise else ""
+            says = f"neither image shows any texture{rest}: the ratio is not known"
+            return [*findings, Finding(says, values, "subtract_noise", "no texture")]
+        ratio = (near - far) / (near + far)
+        verdict, where = "as sharp in both", "in the middle of the range"
+        if near != far:
+            name = "near" if near > far else "far"
+            verdict, where = f"sharper in {name}", f"on the {name} side of the range"
+        says = (
+            f"(near - far) / (near + far) is {ratio:+.3f}: {verdict}, so the surface lies {where}"
+        )
+        return [*findings, Finding(says, {**values, "ratio": ratio}, None, verdict)]
 
 
 def window_side_px(stripes: Any, parameters: Any) -> float:

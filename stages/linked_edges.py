@@ -262,13 +262,23 @@ class LinkedEdges(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.edges.linking import Step
+        from stages.edges.stories import linking_story, nearest_end
 
-        step = Step(int(artifacts["edge_step"][y, x]))
-        value = float(artifacts["edge_value"][y, x])
-        kept = "kept" if step >= Step.LOW else "not an edge"
-        says = f"{kept}: {step.name.lower().replace('_', ' ')}, value {value:.2f}"
-        return [Finding(says, {"step": int(step), "value": value}, "max_cost")]
+        edge, line = bool(artifacts["edges_linked"][y, x]), bool(artifacts["region_lines"][y, x])
+        verdict = "edge" if edge else "line on the background" if line else "no edge"
+        told = linking_story(x, y, artifacts["edge_choice"], artifacts["linking"], p)
+        values = {
+            name: artifacts[name][y, x]
+            for name in ("edge_step", "edge_value", "edges_reconstructed", "links", "edges_linked")
+        }
+        findings = [Finding(clause.says, clause.values, clause.parameter) for clause in told[:-1]]
+        if not line:
+            ending = nearest_end(x, y, artifacts["linking"].linked, p)
+            if ending is not None:
+                findings.append(Finding(ending.says, ending.values, ending.parameter))
+        last = told[-1]
+        findings.append(Finding(last.says, {**values, **last.values}, last.parameter, verdict))
+        return findings
 
     def scorer(self) -> Scorer:
         from stages.edges.scorers import EdgeScorer

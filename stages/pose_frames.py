@@ -166,18 +166,36 @@ class PoseFrames(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        from stages.wording import apart
+
         label = int(artifacts["labels"][y, x])
-        for pose in artifacts["poses"]:
-            if pose["region"] == label:
-                return [
-                    Finding(
-                        f"{pose['object']} turned by {pose['rotation_deg']:.1f}°, outline "
-                        f"{pose['distance']:.3f} against ζ {pose['zeta']:.3f}",
-                        {"rotation_deg": pose["rotation_deg"], "distance": pose["distance"]},
-                        "zeta_scale",
-                    )
-                ]
-        return [Finding("not in the picked surface", {"label": label})]
+        about = f"region {label}" if label else "no region"
+        pose = next((one for one in artifacts["poses"] if one["region"] == label), None)
+        if pose is None:
+            says = "not in a surface that was picked, so it has no pose"
+            return [Finding(says, {"labels": label}, None, "no pose", about)]
+        tilted = f"{pose['object']} turned by {pose['rotation_deg']:.2f}°"
+        settled = {
+            "outline": "its outline leaves no other turn",
+            "range": "its outline leaves other turns, which the depth around it rules out",
+            "open": "its outline leaves others, and the depth around it does not tell: "
+            + ", ".join(f"{other:.1f}°" for other in pose["open_rotations_deg"]),
+        }[pose["settled_by"]]
+        values = {"labels": label, "rotation_deg": pose["rotation_deg"]}
+        held = {"distance": pose["distance"], "zeta": pose["zeta"]}
+        over = "not over" if pose["accepted"] else "over"
+        verdict = "pose" if pose["accepted"] else "doubtful pose"
+        return [
+            Finding(f"{tilted}: {settled}", values),
+            Finding(
+                f"outline {apart(pose['distance'], pose['zeta'], 3)} from the manifold, {over} ζ "
+                f"{pose['zeta']:.3f}",
+                held,
+                "zeta_scale",
+                verdict,
+                about,
+            ),
+        ]
 
     def scorer(self) -> Scorer:
         from stages.matching.scorers import PoseScorer

@@ -194,30 +194,55 @@ class Recognition(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        from stages.edges.stories import on_line
+        from stages.matching.recognise import Reason, checks, explain_row
+
         label = int(artifacts["labels"][y, x])
-        candidates = artifacts["candidates"]
-        database = artifacts.get("models")
+        candidates, database = artifacts["candidates"], artifacts.get("models")
         if artifacts["verdict"] is None or database is None:
             return [Finding("no verdict: needs depth, intrinsics and models")]
+        values: dict[str, Any] = {"labels": label}
+        if not label:
+            says = "in no region, so in no candidate"
+            return [Finding(says, values, None, "no candidate", "no region")]
+        region = artifacts["regions"][label - 1]
+        edge = on_line(x, y, artifacts)
+        beside = f"region {label}, beside {edge}" if edge else ""
         rows = candidates[candidates["label"] == label]
-        if not label or not len(rows):
-            return [Finding("in no candidate: background, or no plane", {"label": label})]
-        from stages.matching.recognise import explain_row
-
-        row = rows[0]
+        if region["background"]:
+            says = f"region {label} is background, so no candidate"
+            return [Finding(says, values, None, "no candidate", beside or f"region {label}")]
+        if not len(rows):
+            says = f"region {label} is refused: it has no plane to be seen along"
+            return [Finding(says, values, None, "refused", beside)]
+        row, rules = rows[0], rules_of(p)
+        told = checks(row, region, database, rules)
         knobs = {
-            1: "min_area", 3: "max_tilt", 4: "max_residual", 5: "step", 6: "phi_scale",
-            7: "zeta_scale",
-        }  # fmt: skip
-        said = explain_row(row, database, rules_of(p))
-        state = "picked" if row["picked"] else "refused" if row["reason"] else "would do"
-        return [
-            Finding(
-                f"region {label}, {state}: {said}",
-                {"label": label, "distance": float(row["distance"])},
-                knobs.get(int(row["reason"])),
-            )
+            Reason.TOO_SMALL: "min_area",
+            Reason.TILTED: "max_tilt",
+            Reason.NOT_FLAT: "max_residual",
+            Reason.OCCLUDED: "covered_share",
+            Reason.FEATURES: "phi_scale",
+            Reason.SHAPE: "zeta_scale",
+        }
+        findings = [
+            Finding(says, numbers, knobs.get(criterion)) for criterion, says, numbers in told
         ]
+        said = explain_row(row, database, rules)
+        if row["reason"]:
+            *passed, failed = findings
+            says, values = f"region {label} is refused: {failed.says}", {**values, **failed.values}
+            return [*passed, Finding(says, values, failed.parameter, "refused", beside)]
+        up = 1e3 * row["elevation_m"]
+        if row["picked"]:
+            says = f"region {label} is picked as {said}; at {up:.2f} mm it is the highest match"
+            return [*findings, Finding(says, values, None, "picked", beside)]
+        best = candidates[candidates["picked"]][0]
+        says = (
+            f"region {label} would do as {said}; but at {up:.2f} mm it lies lower than region "
+            f"{best['label']} at {1e3 * best['elevation_m']:.2f} mm"
+        )
+        return [*findings, Finding(says, values, None, "not the highest", beside)]
 
     def scorer(self) -> Scorer:
         from stages.matching.scorers import RecognitionScorer

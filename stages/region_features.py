@@ -128,11 +128,59 @@ class RegionFeatures(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        from stages.edges.regions import least_area_px
+        from stages.edges.stories import enclosed_px, on_line
+
         label = int(artifacts["labels"][y, x])
+        walls = artifacts["linking"].walls
+        wall = 0 if walls is None else int(walls.labels[y, x])
+        findings: list[Finding] = []
+        line = bool(artifacts["region_lines"][y, x])
+        edge = on_line(x, y, artifacts)
+        shared = f"given to region {label} beside it" if label else "between regions, given to none"
+        if wall:
+            findings.append(
+                Finding(f"in upright wall {wall} of those that the depth shows", {"wall": wall})
+            )
+        elif line:
+            findings.append(Finding(f"on a line: {shared}", {"region_lines": line}))
+        else:
+            area = enclosed_px(x, y, artifacts["region_lines"], walls)
+            least = least_area_px(artifacts["region_lines"].shape, p.min_area)
+            small = area < least
+            says = f"lines close {area} px around it, {'under' if small else 'not under'} {least}"
+            if small:
+                says += f": no region of its own, {shared}"
+            findings.append(Finding(says, {"enclosed_px": area}, "min_area"))
         if label == 0:
-            return [Finding("in no closed region", {"label": 0}, "min_area")]
+            says = "in no closed region"
+            return [*findings, Finding(says, {"labels": 0}, None, "no region")]
         row = artifacts["regions"][label - 1]
-        return [Finding(f"in region {describe(row)}", {"label": label}, "min_area")]
+        about = f"region {label}, beside {edge}" if edge else ""
+        values = {"labels": label, "area_px": row["area_px"], "background": row["background"]}
+        if row["plane_px"] > 0:
+            findings.append(
+                Finding(
+                    f"its plane rests on {row['plane_px']} px, {1e3 * row['residual_m']:.2f} mm "
+                    f"from flat: {1e3 * row['elevation_m']:.2f} mm up, tilt {row['tilt_deg']:.1f}°",
+                    {name: row[name] for name in ("plane_px", "elevation_m", "tilt_deg")},
+                    "least_points",
+                )
+            )
+        else:
+            says = (
+                f"no plane: depth is known on {100 * row['known_share']:.0f} % of it, and too "
+                "little of that lies far enough inside"
+            )
+            findings.append(Finding(says, {"known_share": row["known_share"]}, "inset"))
+        said = f"region {label}: {row['area_px']} px, shape {row['shape_factor']:.3f}"
+        if row["background"]:
+            says = (
+                f"{said}, background: it has {row['border_px']} px of the image's border, or lies "
+                "flat on the table"
+            )
+            return [*findings, Finding(says, values, None, "background", about)]
+        return [*findings, Finding(said, values, None, "region", about)]
 
     def scorer(self) -> Scorer:
         from stages.edges.scorers import RegionScorer

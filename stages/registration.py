@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from stages.artifacts import (
@@ -184,17 +185,54 @@ class Registration(Stage):
             )
         ]
 
-    def explain(self, x: int, y: int, artifacts: Any, p: Any) -> list[Finding]:
-        near, far = float(artifacts["near"][y, x]), float(artifacts["far"][y, x])
-        saturated = bool(artifacts["saturated"][y, x])
-        state = "saturated" if saturated else "not saturated"
-        return [
+    def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
+        import numpy as np
+
+        near, far = artifacts["near"][y, x], artifacts["far"][y, x]
+        drift_px, gain = artifacts["registration_drift_px"], artifacts["gain_drift"]
+        origin = {"calibration": "the calibration's map", "pair": "a map measured on this pair"}
+        if artifacts.get("calibration") is None:
+            origin["calibration"] = origin["pair"]
+        brought = origin.get(p.similarity, "no map at all")
+        if p.correct_gain:
+            brought += f" and times {gain:.4f} for the balance of light"
+        findings = [
             Finding(
-                f"near {near:.1f}, far {far:.1f}: {state} (limit {p.saturation_percent:g} %)",
-                {"near": near, "far": far, "saturated": saturated},
-                "saturation_percent",
-            )
+                f"near {near:.1f}, far {far:.1f} grey levels; far was brought here by {brought}",
+                {"near": near, "far": far, "gain_drift": gain},
+                "correct_gain",
+            ),
+            Finding(
+                f"over the whole image near and far are {drift_px:.2f} px apart",
+                {"registration_drift_px": drift_px},
+                "similarity",
+            ),
         ]
+        taken = "the flat image"
+        if artifacts.get("flat_image") is None or p.intensity != "flat":
+            taken = "near and far averaged over a stripe period"
+        intensity = artifacts["intensity"][y, x]
+        findings.append(
+            Finding(
+                f"intensity {intensity:.1f} grey levels, from {taken}",
+                {"intensity": intensity},
+                "intensity",
+            )
+        )
+        top, saturated = artifacts["full_scale"], bool(artifacts["saturated"][y, x])
+        limit = p.saturation_percent / 100 * top
+        if not saturated:
+            says = f"near is under {limit:.1f} and so is far where it comes from: not saturated"
+        elif near >= limit:
+            says = f"near is not under {limit:.1f}: saturated, and carries no depth"
+        elif not np.isfinite(artifacts["near_image"][y, x]).all():
+            says = "near is not a number: carries no depth"
+        else:
+            says = f"far is not under {limit:.1f} where it comes from: saturated, carries no depth"
+        values = {"saturated": saturated, "full_scale": top, "limit": limit}
+        verdict = "saturated" if saturated else "not saturated"
+        findings.append(Finding(says, values, "saturation_percent", verdict))
+        return findings
 
 
 def _size(image: Any) -> str:

@@ -19,6 +19,7 @@ from workbench.pipeline import Pipeline, Run, dependencies
 from workbench.report import RunReport
 from workbench.session import Session
 from workbench.stage import Logged, RecordedCamera, RecordedImage, Resource
+from workbench.why import image_size
 
 FRAME_TIMELINE = "frame"
 STAMP_TIMELINE = "stamp"
@@ -29,16 +30,30 @@ _SOURCE = (90, 130, 200)
 _CHAPTER_SHARE = 2.4
 
 
+_MARK = "bench/pixel"
+_STORY = "bench/why/story"
+_OUTCOME = "bench/why/outcome"
+_MARK_COLOUR = (255, 60, 220)
+_MARK_INNER_PX, _MARK_OUTER_PX = 2.5, 9.0
+
+
 class _PathKeeper:
-    """A recording stream that remembers which entities were logged over time."""
+    """A recording stream that remembers which entities were logged over time.
+
+    And which of them are pictures, by the width and height of each.
+    """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._recording = recording
         self.paths: set[str] = set()
+        self.pictures: dict[str, tuple[int, int]] = {}
 
     def log(self, path: str, *entities: Any, static: bool = False, **options: Any) -> None:
         if not static:
             self.paths.add(path)
+        for entity in entities:
+            if isinstance(entity, rr.Image | rr.DepthImage | rr.SegmentationImage):
+                self.pictures[path] = _size_of(entity)
         self._recording.log(path, *entities, static=static, **options)
 
     def __getattr__(self, name: str) -> Any:
@@ -46,11 +61,17 @@ class _PathKeeper:
 
 
 class Bridge:
-    """Logs the runs of one session to a recording stream."""
+    """Logs the runs of one session to a recording stream.
 
-    def __init__(self, session: Session, recording: rr.RecordingStream) -> None:
+    With ``asks`` the layout has a place for a pixel's story, and :meth:`mark` shows the pixel on
+    every picture of the frame's own grid.
+    """
+
+    def __init__(self, session: Session, recording: rr.RecordingStream, asks: bool = False) -> None:
         self.session = session
         self.recording = recording
+        self.asks = asks
+        self._pictures: dict[str, tuple[int, int]] = {}
         self._defects_told = -1
         self._laid_out: set[str] = set()
         self._named_scores: set[str] = set()
@@ -109,6 +130,29 @@ class Bridge:
             for path in sorted(self._paths.get(owner, set()) - keeper.paths):
                 self.recording.log(path, rr.Clear(recursive=False))
             self._paths[owner] = keeper.paths
+            self._pictures |= keeper.pictures
+
+    def mark(self, x: int, y: int, story: str, outcome: str = "") -> None:
+        """Mark pixel (x, y) on the pictures, whatever the frame, and tell its story (markdown).
+
+        ``outcome`` is what a search for the smallest change found, which stands below the story.
+        """
+        # Rerun's images have their first pixel from 0 to 1.
+        u, v = x + 0.5, y + 0.5
+        strokes = [
+            [(u + a * _MARK_INNER_PX, v + b * _MARK_INNER_PX),
+             (u + a * _MARK_OUTER_PX, v + b * _MARK_OUTER_PX)]
+            for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))
+        ]  # fmt: skip
+        self.recording.log(
+            _MARK,
+            rr.LineStrips2D(
+                strokes, colors=_MARK_COLOUR, radii=rr.Radius.ui_points(1.5), draw_order=100
+            ),
+            static=True,
+        )
+        for path, text in ((_STORY, story), (_OUTCOME, outcome or "*not looked for*")):
+            self.recording.log(path, rr.TextDocument(text, media_type="text/markdown"), static=True)
 
     def close(self, report: RunReport) -> None:
         """What is known only at the end: the recording's defects in full, and how it pairs."""
@@ -252,16 +296,57 @@ class Bridge:
             for chapter, row in rows.items()
             if row
         ]
+        page: Any = rrb.Vertical(
+            *chapters,
+            rrb.Horizontal(*shelf, column_shares=[1.0] * (len(shelf) - 1) + [1.8]),
+            row_shares=[_CHAPTER_SHARE] * len(chapters) + [1],
+        )
+        if self.asks:
+            _show_mark(page, self._pictures_on_grid(run))
+            told = rrb.Vertical(
+                rrb.TextDocumentView(origin=_STORY, name="why"),
+                rrb.TextDocumentView(origin=_OUTCOME, name="what would turn it"),
+                row_shares=[4.0, 1.0],
+            )
+            page = rrb.Horizontal(page, told, column_shares=[3.0, 1.0])
         return rrb.Blueprint(
-            rrb.Vertical(
-                *chapters,
-                rrb.Horizontal(*shelf, column_shares=[1.0] * (len(shelf) - 1) + [1.8]),
-                row_shares=[_CHAPTER_SHARE] * len(chapters) + [1],
-            ),
+            page,
             rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
             rrb.SelectionPanel(state="collapsed"),
             rrb.BlueprintPanel(state="collapsed"),
         )
+
+    def _pictures_on_grid(self, run: Run) -> set[str]:
+        """The pictures on which pixels are asked: recorded ones of other channels are not."""
+        pipeline = self.session.pipeline
+        grid, own = image_size(pipeline, run), f"recorded/{pipeline.channels[0][0]}"
+        return {
+            path
+            for path, size in self._pictures.items()
+            if size == grid and (path == own or not path.startswith("recorded/"))
+        }
+
+
+def _size_of(picture: Any) -> tuple[int, int]:
+    """Width and height of a picture that is about to be logged."""
+    form = picture.format.as_arrow_array()[0].as_py()
+    return form["width"], form["height"]
+
+
+def _show_mark(part: Any, pictures: set[str]) -> None:
+    """Let every 2D view of the layout that has one of these pictures show the marked pixel too.
+
+    Charts are 2D views as well, and a pixel has no place on them.
+    """
+    if isinstance(part, rrb.Container):
+        for inner in part.contents:
+            _show_mark(inner, pictures)
+    elif isinstance(part, rrb.Spatial2DView):
+        origin = str(part.origin).strip("/")
+        if any(f"{path}/".startswith(f"{origin}/") for path in pictures):
+            contents: Any = part.contents
+            shown = [contents] if isinstance(contents, str) else list(contents)
+            part.contents = [*shown, f"+ /{_MARK}"]
 
 
 def _share(view: Any) -> float:

@@ -258,6 +258,48 @@ def evaluate(
 
 
 @app.command()
+def why(
+    recording: Rec,
+    frame: Annotated[int, typer.Option(help="The frame, counted from 0.", metavar="N")],
+    pixel: Annotated[str, typer.Option(help="The pixel: column and row, from 0.", metavar="X,Y")],
+    stage: Annotated[
+        str | None,
+        typer.Option(
+            help="Turn this stage's verdict; the last that is on this very pixel if not given."
+        ),
+    ] = None,
+    search: Annotated[
+        bool, typer.Option("--search/--no-search", help="Look for the smallest change.")
+    ] = True,
+    save: Annotated[
+        Path | None, typer.Option(help="Keep the pictures and the story in this .rrd file.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of the viewer; needs no screen.")
+    ] = None,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1920x1080",
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """A pixel's story through the stages, and the smallest change that would turn its verdict."""
+    from workbench.commands import why as command
+
+    options = _options(
+        recording, calibration, models, preset, config, assignments, topic, None, until, plugin
+    )
+    command.run(options, frame, pixel, stage, search, as_json, save, screenshot, window)
+
+
+@app.command()
 def calibrate(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],

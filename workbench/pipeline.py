@@ -126,6 +126,16 @@ class Pipeline:
         other.settings = settings
         return other
 
+    def up_to(self, stage: str) -> Pipeline:
+        """This stage and what it needs alone, with settings, resources and results in common."""
+        return self.with_stages(ordered({one.name: one for one in self.stages}, stage))
+
+    def with_stages(self, stages: Sequence[Stage]) -> Pipeline:
+        """Some of the same stages, in an order in which each finds what it needs."""
+        other = copy.copy(self)
+        other.stages = list(stages)
+        return other
+
     def sources(self, kind: type[S]) -> list[S]:
         """The needs of one kind that no stage gives, without doubles; required where any is."""
         found: dict[str, S] = {}

@@ -215,8 +215,9 @@ def knob(
 class Finding:
     """One sentence of a pixel's story: a value, the threshold that it met, and what followed.
 
-    ``values`` are the numbers of the sentence, exactly as they are: a key that is an artifact with
-    axes ``H W`` holds that artifact's value at the pixel, so that a reader can check the sentence.
+    ``values`` are the numbers of the sentence, exactly as they are.  A key that is an artifact
+    holds that artifact's value at the pixel, or as a whole where it has no axes ``H W``, so that
+    the sentence can be checked.
     ``parameter`` is the knob of the same stage that the value was held against, or that decided.
 
     ``verdict`` is the state that the pixel is in from here on, in a word or two without numbers

@@ -562,10 +562,26 @@ def folded_back(
     There the ratio takes values that it also has between the planes, but both images are
     blurred: over a few stripe periods the contrast is less than ``least`` of what the
     calibration has at that depth.  One window may show so little for other reasons (a rim, a
-    shadow); a neighbourhood of four periods does not.
+    shadow); a neighbourhood of four periods does not.  For the arguments see
+    :func:`contrast_of_cells`.
+    """
+    shown, enough = contrast_of_cells(focus_sum, light, relative_depth, modulation, period_px)
+    low = (shown < np.float32(least) * enough).astype(np.uint8)
+    return on_pixels(low, focus_sum.shape) > 0
+
+
+def contrast_of_cells(
+    focus_sum: np.ndarray,
+    light: np.ndarray,
+    relative_depth: np.ndarray,
+    modulation: np.ndarray,
+    period_px: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The contrast that neighbourhoods show, and what the calibration has there; float32 [h w].
 
     ``focus_sum`` is focus_near + focus_far, ``light`` near + far, float32 [H W];
-    ``relative_depth`` [H W] has NaN where unknown; ``modulation`` as in :class:`Response`.
+    ``relative_depth`` [H W] has NaN where unknown; ``modulation`` as in :class:`Response`.  A cell
+    is a little less than a stripe period wide.
     """
     height, width = focus_sum.shape
     cell = max(1, round(_FOLD_CELL_PERIODS * period_px))
@@ -585,10 +601,13 @@ def folded_back(
     for coefficient in modulation[::-1]:
         expected = expected * np.clip(depth, 0, 1) + coefficient
     there = (share > 0).astype(np.float32)
-    shown = pooled(cells(focus_sum) * there)
-    enough = pooled(expected * cells(light) * there)
-    low = (shown < np.float32(least) * enough).astype(np.uint8)
-    return cv2.resize(low, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return pooled(cells(focus_sum) * there), pooled(expected * cells(light) * there)
+
+
+def on_pixels(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values of cells [h w] on the pixels [H W] that they are made of."""
+    height, width = shape[:2]
+    return cv2.resize(cells, (width, height), interpolation=cv2.INTER_NEAREST)
 
 
 def confidence_from_error(error_percent: np.ndarray, half_at_percent: float) -> np.ndarray:

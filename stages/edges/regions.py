@@ -215,8 +215,7 @@ def closed_regions(
     if walls is not None:
         np.copyto(labels, walls + np.int32(n - 1), where=walls > 0)
         n += int(walls.max(initial=0))
-    scale = image_scale(edges.shape)
-    count = _relabel(labels, max(int(round(min_area * scale * scale)), 1), n, first_wall)
+    count = _relabel(labels, least_area_px(edges.shape, min_area), n, first_wall)
     if grow and count:
         levels = np.zeros(edges.shape, np.float32) if image is None else image
         levels = np.nan_to_num(np.ascontiguousarray(levels, np.float32))
@@ -228,6 +227,13 @@ def closed_regions(
             g = gradient
             _grow(labels, levels, mean, g.gx, g.gy, g.magnitude, g.thin)
     return labels.astype(np.int32, copy=False)
+
+
+def least_area_px(shape: tuple[int, ...], min_area: float) -> int:
+    """The least area of a region in an image of this shape, from pixels at 256²."""
+    height, width = shape[:2]
+    scale = image_scale((height, width))
+    return max(int(round(min_area * scale * scale)), 1)
 
 
 # -- the outline ---------------------------------------------------------------------------------

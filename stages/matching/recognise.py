@@ -22,9 +22,10 @@ from stages.matching.surfaces import (
     shortest_turn,
     soft_view,
 )
+from stages.wording import apart
 
 __all__ = [
-    "Reason", "Rules", "contradiction", "explain_row", "find_candidates", "match_part",
+    "Reason", "Rules", "checks", "contradiction", "explain_row", "find_candidates", "match_part",
     "verdict_of",
 ]  # fmt: skip
 
@@ -243,6 +244,97 @@ def explain_row(row: Any, database: Database, rules: Rules) -> str:
     if reason is Reason.SURROUNDINGS:
         return f"measures of {name}, but what lies around it is lower than {name} is"
     return f"{name}: features {row['distance']:.3f}, outline {row['shape_distance']:.3f}"
+
+
+def checks(
+    row: Any, region: Any, database: Database, rules: Rules
+) -> list[tuple[Reason, str, dict[str, Any]]]:
+    """The criteria in order, up to the one that the candidate failed: which, in words, numbers."""
+    failed = Reason(int(row["reason"]))
+    name = database.names[int(row["model"])] if row["model"] >= 0 else "none"
+    smallest = rules.min_area * database.smallest_mm2
+    phi, zeta = rules.phi_scale * database.phi, rules.zeta_scale * float(row["zeta"])
+    area = apart(row["area_mm2"], smallest, 1)
+    tilt = apart(row["tilt_deg"], rules.max_tilt_deg, 1)
+    residual = apart(1e3 * region["residual_m"], rules.max_residual_mm, 2)
+    share = apart(100 * row["occluded_share"], 100 * rules.covered_share, 1)
+    said: list[tuple[Reason, str, dict[str, Any]]] = [
+        (
+            Reason.TOO_SMALL,
+            f"area {area} mm² is not under {smallest:.1f} mm², the smallest part's times "
+            f"{rules.min_area:g}",
+            {"area_mm2": row["area_mm2"]},
+        ),
+        (
+            Reason.CUT,
+            "it does not touch the image's border",
+            {"border_px": region["border_px"]},
+        ),
+        (
+            Reason.TILTED,
+            f"tilt {tilt}° is not over {rules.max_tilt_deg:g}°",
+            {"tilt_deg": row["tilt_deg"]},
+        ),
+        (
+            Reason.NOT_FLAT,
+            f"{residual} mm from its plane, not over {rules.max_residual_mm:g} mm",
+            {"residual_m": region["residual_m"]},
+        ),
+        (
+            Reason.OCCLUDED,
+            f"others lie {rules.step_mm:g} mm or more above it along "
+            f"{share} % of its border, not over "
+            f"{100 * rules.covered_share:g} %",
+            {"occluded_share": row["occluded_share"], "occluded_by": row["occluded_by"]},
+        ),
+        (
+            Reason.FEATURES,
+            f"features {apart(row['distance'], phi, 3)} from {name}, not over φ {phi:.3f}",
+            {"distance": row["distance"], "phi": phi},
+        ),
+        (
+            Reason.SHAPE,
+            f"outline {apart(row['shape_distance'], zeta, 3)} from {name}, not over ζ {zeta:.3f}",
+            {"shape_distance": row["shape_distance"], "zeta": zeta},
+        ),
+        (Reason.SURROUNDINGS, f"what lies around it is what {name} has around it", {}),
+    ]
+    if failed is Reason.NONE:
+        return said
+    passed = [one for one in said if one[0] < failed]
+    values = next(one[2] for one in said if one[0] is failed)
+    return [*passed, (failed, refusal(row, region, database, rules), values)]
+
+
+def refusal(row: Any, region: Any, database: Database, rules: Rules) -> str:
+    """The criterion that a candidate failed, with the numbers that :func:`explain_row` spares."""
+    reason = Reason(int(row["reason"]))
+    name = database.names[int(row["model"])] if row["model"] >= 0 else "none"
+    if reason is Reason.TOO_SMALL:
+        least = rules.min_area * database.smallest_mm2
+        return f"area {apart(row['area_mm2'], least, 1)} mm² is under {least:.1f} mm²"
+    if reason is Reason.CUT:
+        return f"leaves the image: {region['border_px']} px of it are on the image's border"
+    if reason is Reason.TILTED:
+        tilt = apart(row["tilt_deg"], rules.max_tilt_deg, 1)
+        return f"tilt {tilt}° is over {rules.max_tilt_deg:g}°"
+    if reason is Reason.NOT_FLAT:
+        residual = apart(1e3 * region["residual_m"], rules.max_residual_mm, 2)
+        return f"not flat: {residual} mm from its plane, over {rules.max_residual_mm:g} mm"
+    if reason is Reason.OCCLUDED:
+        share = apart(100 * row["occluded_share"], 100 * rules.covered_share, 1)
+        return (
+            f"Occ: region {row['occluded_by']} (and others) lie {rules.step_mm:g} mm or more above "
+            f"it along {share} % of its border, over {100 * rules.covered_share:g} %"
+        )
+    if reason is Reason.FEATURES:
+        phi = rules.phi_scale * database.phi
+        distance = apart(row["distance"], phi, 3)
+        return f"features {distance} from {name}, the nearest, over φ {phi:.3f}"
+    if reason is Reason.SHAPE:
+        zeta = rules.zeta_scale * row["zeta"]
+        return f"outline {apart(row['shape_distance'], zeta, 3)} from {name}, over ζ {zeta:.3f}"
+    return explain_row(row, database, rules)
 
 
 def verdict_of(candidates: np.ndarray, database: Database, rules: Rules) -> dict[str, Any]:

@@ -22,7 +22,7 @@ def run(
     window: str,
 ) -> None:
     """Replay; exits with 1 if a stage failed on any frame or there was no frame."""
-    size = _window(window)
+    size = window_size(window)
     for flag, path in (("--save", save), ("--screenshot", screenshot), ("--json", json_report)):
         if path is not None:
             check_output(flag, path)
@@ -84,7 +84,8 @@ def _free_name(path: Path) -> Path:
     return free
 
 
-def _window(text: str) -> tuple[int, int]:
+def window_size(text: str) -> tuple[int, int]:
+    """``WxH`` as (W, H).  Raises :class:`UsageError`."""
     width, x, height = text.partition("x")
     if not (x and width.isdigit() and height.isdigit() and int(width) and int(height)):
         raise UsageError(f"--window {text}: expected WIDTHxHEIGHT, as 1920x1080")
