@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, get_args
 
-from workbench import why
 from workbench.errors import DataError, UsageError, one_line
 from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.recording import Frame
@@ -31,7 +30,7 @@ from workbench.settings import (
 )
 from workbench.stage import Histogram, Knob, Stage
 from workbench.tune.frames import FrameSource
-from workbench.why import Story, story
+from workbench.why import Search, Story, smallest_change, story
 
 View = Literal["live", "A", "B", "beside", "difference"]
 VIEWS: tuple[View, ...] = get_args(View)
@@ -420,7 +419,7 @@ class LiveBench:
 
     def smallest_change(
         self, x: int, y: int, layer: str = "", before_each: Callable[[], None] = lambda: None
-    ) -> Any:
+    ) -> Search | None:
         """The least change of one parameter that turns the verdict on pixel (x, y).
 
         Takes up to seconds and runs beside the worker, with results of its own; ``before_each``
@@ -429,8 +428,7 @@ class LiveBench:
         pipeline, run = self._shown_under(layer)
         apart = copy.copy(pipeline)
         apart.store = ResultStore(_SEARCH_BYTES)
-        search: Any = getattr(why, "smallest_change", None)
-        return None if search is None else search(apart, run, x, y, before_each=before_each)
+        return smallest_change(apart, run, x, y, before_each=before_each)
 
     def _shown_under(self, layer: str) -> tuple[Pipeline, Run]:
         with self._lock:

@@ -25,7 +25,7 @@ from workbench.report import write_beside
 from workbench.stage import Histogram, Knob
 from workbench.tune.canvas import Canvas
 from workbench.tune.live import LiveBench, Snapshot
-from workbench.why import Story
+from workbench.why import Change, Story
 
 _DRAG_SECONDS = 0.04
 _PLAY_SECONDS = 0.25
@@ -346,7 +346,7 @@ class _Page:
             else:
                 self._offer(search.change, search.runs)
 
-    def _offer(self, change: Any, runs: int) -> None:
+    def _offer(self, change: Change, runs: int) -> None:
         ui.label("The smallest change that turns it").classes("change-title")
         before, after = _short(change.before), _short(change.after)
         ui.label(f"{change.address}").classes("mono")
