@@ -214,6 +214,9 @@ def tune(
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
     ] = True,
+    native: Annotated[
+        bool, typer.Option("--native", help="Use Rerun's own window, with sliders alone.")
+    ] = False,
     calibration: Calibration = None,
     models: Models = None,
     preset: Preset = None,
@@ -231,7 +234,7 @@ def tune(
     options = _options(
         recording, calibration, models, preset, config, assignments, topic, frames, until, plugin
     )
-    command.run(options, port, browser, as_json)
+    command.run(options, port, browser, native, as_json)
 
 
 @app.command()

@@ -250,6 +250,31 @@ def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
             child.kill()
 
 
+@contextmanager
+def native_viewer(headless: bool = False) -> Iterator[tuple[int, subprocess.Popen[bytes]]]:
+    """A native viewer on a free port of loopback, with its process; ended with the block.
+
+    Raises :class:`DataError` where it cannot be opened.
+    """
+    port = free_port()
+    arguments = [rerun_program(), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
+    arguments += ["--memory-limit", "2GB", "--server-memory-limit", "256MB"]
+    if headless:
+        arguments += ["--headless", "--window-size", "1600x900"]
+    child = subprocess.Popen(
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        _await_port(port, child)
+        yield port, child
+    finally:
+        child.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=5)
+        if child.poll() is None:
+            child.kill()
+
+
 def unpack_web_viewer(folder: Path) -> None:
     """Put the web viewer that the Rerun program carries (script and wasm) into ``folder``.
 

@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 _MOST_PORTS = 65535
 
 
-def run(options: Options, port: int | None, browser: bool, as_json: bool) -> None:
-    """Serve until Ctrl-C."""
+def run(options: Options, port: int | None, browser: bool, native: bool, as_json: bool) -> None:
+    """Serve until Ctrl-C, or until the native viewer is closed."""
+    if native and port is not None:
+        raise UsageError("--port: the native viewer has no page; leave out --port or --native")
     if port is not None and not 1 <= port <= _MOST_PORTS:
         raise UsageError(f"--port {port}: expected 1 to {_MOST_PORTS}")
     session = Session.open(options)
@@ -30,6 +32,13 @@ def run(options: Options, port: int | None, browser: bool, as_json: bool) -> Non
         raise DataError(f"{options.recording}: no frame in it, or in --frames")
     from workbench.viewer import free_port, has_display
 
+    if native:
+        if not has_display():
+            raise DataError("--native: there is no display; without it the page opens in a browser")
+        with suppress(KeyboardInterrupt):
+            _run_native(session, as_json)
+            interrupts.check()
+        return
     if port is None:
         port = free_port()
     else:
@@ -67,6 +76,24 @@ def page_of(session: Session, folder: Path, port: int) -> LivePage:
         save_to=Path(f"{path.stem}.tuned.toml").absolute(),
     )
     return LivePage(bench, options, folder, port)
+
+
+def _run_native(session: Session, as_json: bool) -> None:
+    from workbench.digest import digest_of
+    from workbench.tune.canvas import live_recording
+    from workbench.tune.frames import SessionFrames
+    from workbench.tune.live import LiveBench
+    from workbench.tune.native import NativePanel
+    from workbench.viewer import native_viewer
+
+    bench = LiveBench(session.pipeline, SessionFrames(session), session.provenance_of)
+    recording = live_recording(digest_of([str(session.provenance())]))
+    with native_viewer() as (port, child):
+        panel = NativePanel(bench, recording, port)
+        if as_json:
+            print(to_json({"port": port, "recording": str(session.recording.path)}), flush=True)
+        panel.serve(lambda: child.poll() is None)
+        recording.disconnect()
 
 
 def _check_free(port: int) -> None:

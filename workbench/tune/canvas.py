@@ -96,7 +96,8 @@ class Canvas:
     """A :class:`workbench.tune.live.Display` that draws into a Rerun recording.
 
     ``flush`` sends on what was logged; ``renew`` is called before everything is drawn again for
-    a viewer that has just come.
+    a viewer that has just come.  ``beside`` gives what stands to the left of the pictures, and
+    how wide both are.
     """
 
     def __init__(
@@ -105,7 +106,9 @@ class Canvas:
         recording: rr.RecordingStream,
         flush: Callable[[], None],
         renew: Callable[[], None] = lambda: None,
+        beside: Callable[[Picture], tuple[Any, Sequence[float]]] | None = None,
     ) -> None:
+        self._beside = beside
         self.pipeline = pipeline
         self.recording = recording
         self._flush = flush
@@ -296,6 +299,9 @@ class Canvas:
             root = self._focus_layout(picture.focus, parts[""], runs[""])
         else:
             root = self._overview(parts[""], runs[""])
+        if self._beside is not None:
+            panel, shares = self._beside(picture)
+            root = rrb.Horizontal(panel, root, column_shares=shares)
         return rrb.Blueprint(
             root,
             rrb.TimePanel(state="hidden", timeline=TIMELINE, play_state="following"),

@@ -69,6 +69,9 @@ class Picture:
     focus: str
     """The stage whose views are shown large; empty for all."""
     parts: tuple[Part, ...]
+    settings: Settings
+    """The live settings, whatever is shown."""
+    frame: int = 0
     redraw: bool = False
     """Whether everything is drawn again, for a viewer that has seen none of it."""
 
@@ -619,7 +622,15 @@ class LiveBench:
             with self._lock:
                 self._shown = replace(self._shown, trouble=one_line(error))
             return
-        picture = Picture(wish.number, wish.view, wish.focus, _parts(wish), wish.redraw)
+        picture = Picture(
+            wish.number,
+            wish.view,
+            wish.focus,
+            _parts(wish),
+            wish.settings,
+            wish.frame,
+            wish.redraw,
+        )
         self.display.begin(picture)
         runs: dict[str, Run] = {}
         first_ms = 0.0

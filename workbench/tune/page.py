@@ -723,14 +723,21 @@ def _chart_options(histogram: Histogram) -> dict[str, Any]:
 
 
 def _score_table(snapshot: Snapshot) -> str:
+    """The scores before and now, by stage; those that the change has moved stand out."""
     rows = []
+    above = ""
     for name, now in snapshot.scores.items():
+        stage, _, figure = name.partition("/")
+        if stage != above:
+            above = stage
+            rows.append(f"<tr><th colspan='4'>{html.escape(stage)}</th></tr>")
         before = snapshot.before.get(name, float("nan"))
         change = now - before
         moved = math.isfinite(change) and abs(change) > 1e-9 * max(abs(now), 1e-9)
         arrow = ("▲" if change > 0 else "▼") if moved else ""
         rows.append(
-            f"<tr class='{'moved' if moved else ''}'><td>{html.escape(name)}</td>"
+            f"<tr class='{'moved' if moved else ''}'>"
+            f"<td>{html.escape(figure.replace('_', ' '))}</td>"
             f"<td>{before:.3g}</td><td>{now:.3g}</td><td>{arrow}</td></tr>"
         )
     return "<table>" + "".join(rows) + "</table>"
