@@ -160,7 +160,7 @@ class NativePanel:
     def _panel(self, picture: Picture) -> tuple[Any, Sequence[float]]:
         """The sliders as they stand, to the left of the pictures: a tab for each stage."""
         settings = picture.settings
-        tabs = []
+        tabs: list[Any] = []
         active = 0
         for stage in self.bench.stages:
             own = [address for address in self._sliders if address.partition(".")[0] == stage]
@@ -222,9 +222,7 @@ def active_tab(blueprint: Mapping[str, Any]) -> str | None:
         chosen = blueprint.get(f"/{str(container.get('active_tab', '')).strip('/')}", {})
         held = chosen.get("ContainerBlueprint", {})
         views = held.get("contents") or []
-        first = blueprint.get(
-            f"/{views[0] if isinstance(views, list) and views else views!s}", {}
-        )
+        first = blueprint.get(f"/{views[0] if isinstance(views, list) and views else views!s}", {})
         origin = str(first.get("ViewBlueprint", {}).get("space_origin", "")).strip("/")
         if origin.startswith(f"{PANEL}/"):
             return str(held.get("display_name", "")) or None
