@@ -117,6 +117,8 @@ class Canvas:
         self._laid_out: tuple[Any, ...] = ()
         self._differences: dict[str, dict[str, Difference]] = {}
         self._marked: set[str] = set()
+        self._origins: set[str] = set()
+        """What the views are on."""
 
     # -- what the live bench calls ----------------------------------------------------------------
 
@@ -191,25 +193,27 @@ class Canvas:
     def pixel_of(self, entity: str, position: Sequence[float | None]) -> tuple[int, int] | None:
         """The pixel (x, y) under a click on an entity, if there is a picture under it.
 
-        A view holds a picture with what is drawn over it: the entity's own picture, that of what
-        it lies in, or that beside it.
+        A view holds a picture with what is drawn over it, so any entity of the view will do.
         """
         if len(position) < 2 or position[0] is None or position[1] is None:
             return None
         if len(position) > 2 and position[2] is not None:
             return None
         path = entity.strip("/")
-        pictures = self.pictures()
-        while path:
-            parent = path.rpartition("/")[0]
-            size = pictures.get(path) or next(
-                (s for p, s in pictures.items() if parent and p.rpartition("/")[0] == parent), None
-            )
-            if size is not None:
-                x, y = int(position[0] // 1), int(position[1] // 1)
-                return (x, y) if 0 <= x < size[0] and 0 <= y < size[1] else None
-            path = parent
-        return None
+        around = [o for o in self._origins if path == o or path.startswith(f"{o}/")]
+        if not around:
+            return None
+        origin = max(around, key=len)
+        sizes = {
+            size
+            for picture, size in self.pictures().items()
+            if picture == origin or picture.startswith(f"{origin}/")
+        }
+        if len(sizes) != 1:
+            return None
+        width, height = sizes.pop()
+        x, y = int(position[0] // 1), int(position[1] // 1)
+        return (x, y) if 0 <= x < width and 0 <= y < height else None
 
     # -- drawing ----------------------------------------------------------------------------------
 
@@ -299,6 +303,7 @@ class Canvas:
             root = self._focus_layout(picture.focus, parts[""], runs[""])
         else:
             root = self._overview(parts[""], runs[""])
+        self._origins = {str(view.origin).strip("/") for view in _leaves_of(root)}
         if self._beside is not None:
             panel, shares = self._beside(picture)
             root = rrb.Horizontal(panel, root, column_shares=shares)
