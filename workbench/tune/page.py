@@ -9,15 +9,15 @@ from __future__ import annotations
 import asyncio
 import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+import secrets
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
+from urllib.parse import parse_qs, urlencode
 
 import numpy as np
 from nicegui import Client, background_tasks, ui
-from starlette.requests import Request
 
 from workbench.errors import DataError, UsageError, one_line
 from workbench.files import check_output
@@ -59,16 +59,18 @@ class PageOptions:
 def mount(bench: LiveBench, canvas: Canvas, options: PageOptions, path: str = "/") -> None:
     """Serve the page of a live bench at ``path`` of the NiceGUI application."""
 
+    run = secrets.token_hex(8)
+
     @ui.page(path, title=f"{options.title} · {options.subtitle}", dark=True)
-    def build(request: Request) -> None:
-        query = {key: request.query_params.getlist(key) for key in request.query_params}
-        _Page(bench, canvas, options).build(query)
+    def build() -> None:
+        _Page(bench, canvas, options, run).build()
 
 
 class _Page:
     """One open page."""
 
-    def __init__(self, bench: LiveBench, canvas: Canvas, options: PageOptions) -> None:
+    def __init__(self, bench: LiveBench, canvas: Canvas, options: PageOptions, run: str) -> None:
+        self._run = run
         self.bench = bench
         self.canvas = canvas
         self.options = options
@@ -82,8 +84,8 @@ class _Page:
 
     # -- building ---------------------------------------------------------------------------------
 
-    def build(self, query: Mapping[str, Sequence[str]]) -> None:
-        """Make the page for the client that has come, and take the state of its address."""
+    def build(self) -> None:
+        """Make the page for the client that has come."""
         self._client = ui.context.client
         self._loop = asyncio.get_running_loop()
         ui.add_css(_STYLE)
@@ -104,17 +106,14 @@ class _Page:
             self._build_story()
         ui.keyboard(on_key=self._key, ignore=["input", "textarea"])
         ui.on("viewer_selection", self._clicked)
+        ui.on("bench_restore", self._restore)
         self._client.on_delete(self.bench.subscribe(self._changed))
         self._client.on_connect(lambda: self._start_viewer(version))
-        if query:
-            self._tried(lambda: self.bench.restore(query))
         self._refresh()
 
     def _start_viewer(self, version: str) -> None:
         assert self._client is not None
-        self._client.run_javascript(
-            f"if (!window.benchStarted) {{ window.benchStarted = true; bench.start('{version}'); }}"
-        )
+        self._client.run_javascript(f"bench.start({_json(version)}, {_json(self._run)})")
 
     def _build_bar(self) -> None:
         ui.label(self.options.title).classes("title")
@@ -207,8 +206,9 @@ class _Page:
                 ui.button(
                     icon="close", on_click=lambda: self.story_box.set_visibility(False)
                 ).props("dense flat round size=sm")
-            self.story_text = ui.html("", sanitize=False).classes("story-text")
+            self.story_verdict = ui.html("", sanitize=False).classes("story-verdict")
             self.change_box = ui.element("div").classes("change")
+            self.story_text = ui.html("", sanitize=False).classes("story-text")
         self.story_box.set_visibility(False)
 
     # -- what the user does -----------------------------------------------------------------------
@@ -230,6 +230,11 @@ class _Page:
 
     def set(self, address: str, value: Any, settled: bool) -> None:
         self._tried(lambda: self.bench.set({address: value}, settled))
+
+    def _restore(self, event: Any) -> None:
+        """Take the state from the address that the page was opened with."""
+        if isinstance(event.args, str):
+            self._tried(lambda: self.bench.restore(parse_qs(event.args)))
 
     def _focus(self, stage: str) -> None:
         self._tried(lambda: self.bench.focus(stage))
@@ -320,6 +325,7 @@ class _Page:
         self.bench.mark(x, y)
         where = f" in {layer}" if layer else ""
         self.story_title.text = f"Why pixel {x}, {y}{where}"
+        self.story_verdict.content = _verdict_html(story)
         self.story_text.content = _story_html(story)
         self.story_box.set_visibility(True)
         self.change_box.clear()
@@ -741,6 +747,18 @@ def _score_table(snapshot: Snapshot) -> str:
             f"<td>{before:.3g}</td><td>{now:.3g}</td><td>{arrow}</td></tr>"
         )
     return "<table>" + "".join(rows) + "</table>"
+
+
+def _verdict_html(story: Story) -> str:
+    """What became of the pixel in the end, and the sentence that says why."""
+    told = next((one for one in story.stages if one.stage == story.subject), None)
+    if told is None or told.deciding is None:
+        return ""
+    return (
+        f"<span class='verdict'>{html.escape(told.verdict)}</span> "
+        f"<span class='faint'>{html.escape(told.stage)}</span>"
+        f"<p>{html.escape(told.deciding.says)}</p>"
+    )
 
 
 def _story_html(story: Story) -> str:

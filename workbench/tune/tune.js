@@ -5,6 +5,8 @@ window.bench = (() => {
   let handle = null;
   let socket = null;
   let pieces = 0;
+  let begun = false;
+  const opened = location.search;
   const channel = "bench";
 
   const say = (text, hidden) => {
@@ -40,7 +42,19 @@ window.bench = (() => {
     };
   };
 
-  const start = async (version) => {
+  // What the address asks for is taken once: a page that comes again by itself, after a lost
+  // connection, must not bring back an older state over what other pages have changed since.
+  const restore = (run) => {
+    const again = performance.getEntriesByType("navigation")[0]?.type === "reload"
+      && sessionStorage.getItem("bench") === run;
+    sessionStorage.setItem("bench", run);
+    if (!again && opened.length > 1) emitEvent("bench_restore", opened.slice(1));
+  };
+
+  const start = async (version, run) => {
+    if (begun) return;
+    begun = true;
+    restore(run);
     const canvas = document.getElementById("viewer");
     // The viewer's graphics layer logs tens of thousands of lines, which take longer than it does.
     console.debug = () => {};
