@@ -90,6 +90,24 @@ def test_pictures_of_a_stage_that_fails_are_cleared(drawn: Drawn) -> None:
     assert "edge_stack/low" in drawn.canvas.pictures()
 
 
+def test_pictures_that_fail_are_told_beside_the_stage(
+    drawn: Drawn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def log(*_: Any) -> None:
+        raise ValueError("no ink")
+
+    stage = drawn.bench.stages["focus_maps"]
+    with monkeypatch.context() as broken:
+        broken.setattr(stage, "log", log, raising=False)
+        drawn.bench.redraw()
+        assert drawn.bench.wait(60)
+        assert drawn.canvas.troubles == {"focus_maps": "its pictures: ValueError: no ink"}
+        assert "linked_edges/linked" in drawn.canvas.pictures()
+    drawn.bench.redraw()
+    assert drawn.bench.wait(60)
+    assert not drawn.canvas.troubles
+
+
 def test_differences_and_sides_have_layers_of_their_own(drawn: Drawn) -> None:
     bench = drawn.bench
     bench.pin("A")

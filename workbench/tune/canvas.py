@@ -117,6 +117,8 @@ class Canvas:
         self._laid_out: tuple[Any, ...] = ()
         self._differences: dict[str, dict[str, Difference]] = {}
         self._marked: set[str] = set()
+        self.troubles: dict[str, str] = {}
+        """Why a stage that ran has no pictures, by stage."""
         self._origins: set[str] = set()
         """What the views are on."""
 
@@ -240,14 +242,14 @@ class Canvas:
             return False
         layer.keys[stage.name] = key
         layer.sound.discard(stage.name)
+        self.troubles.pop(stage.name, None)
         layer.begin()
         try:
             if not failed:
                 stage.log(layer, Logged(run.artifacts, parameters, run.frame.truth))
                 layer.sound.add(stage.name)
         except Exception as error:
-            says = rr.TextLog(f"{stage.name}: its pictures: {one_line(error)}", level="ERROR")
-            self.recording.log("bench/errors", says)
+            self.troubles[stage.name] = f"its pictures: {one_line(error)}"
         finally:
             layer.end(stage.name)
         return True
