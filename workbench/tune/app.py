@@ -57,7 +57,7 @@ class LivePage:
             title=self._options.title,
             dark=True,
             show_welcome_message=False,
-            reconnect_timeout=10.0,
+            reconnect_timeout=60.0,
         )
         self.bench.start()
         try:

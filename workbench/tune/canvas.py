@@ -26,6 +26,7 @@ from workbench.errors import one_line
 from workbench.pipeline import Pipeline, Run
 from workbench.stage import Logged, RecordedImage, Stage
 from workbench.tune.live import Part, Picture
+from workbench.viewer import send_blueprint
 
 TIMELINE = "change"
 APPLICATION_ID = "workbench-tune"
@@ -116,6 +117,8 @@ class Canvas:
         self._layers: dict[str, _Layer] = {}
         self._laid_out: tuple[Any, ...] = ()
         self._differences: dict[str, dict[str, Difference]] = {}
+        self._drawn: dict[tuple[str, str], Difference] = {}
+        """Every difference that was drawn since the view was chosen: its place is kept."""
         self._marked: set[str] = set()
         self.troubles: dict[str, str] = {}
         """Why a stage that ran has no pictures, by stage."""
@@ -143,23 +146,18 @@ class Canvas:
 
     def end(self, picture: Picture, runs: Mapping[str, Run]) -> None:
         if picture.view == "difference":
-            self._show_differences(picture, runs["A"], runs["B"])
+            self._show_differences(runs["A"], runs["B"])
+        else:
+            self._drawn = {}
         sound = tuple(sorted((p, tuple(sorted(self._layers[p].sound))) for p in runs))
-        drawn: tuple[str, ...] = ()
-        if picture.view == "difference":
-            drawn = tuple(
-                f"{stage}/{name}"
-                for stage, own in self._differences.items()
-                for name, difference in own.items()
-                if has_picture(difference)
-            )
+        drawn = tuple(self._drawn)
         layout = (picture.view, picture.focus, sound, drawn)
         # A and B shown alone are drawn where the live run is, so that the eye stays where it is.
         if picture.view in ("A", "B"):
             layout = ("live", *layout[1:])
         if layout != self._laid_out:
             self._laid_out = layout
-            self.recording.send_blueprint(self._blueprint(picture, runs))
+            send_blueprint(self.recording, self._blueprint(picture, runs))
         self._flush()
 
     def mark(self, x: int, y: int) -> None:
@@ -254,7 +252,7 @@ class Canvas:
             layer.end(stage.name)
         return True
 
-    def _show_differences(self, picture: Picture, a: Run, b: Run) -> None:
+    def _show_differences(self, a: Run, b: Run) -> None:
         self._differences = differences_of_runs(self.pipeline.stages, a, b)
         lines = [
             "| stage | result | differs | where |",
@@ -265,6 +263,8 @@ class Canvas:
             for name, found in own.items():
                 path = f"{DIFFERENCE}/{stage}/{name}"
                 if has_picture(found):
+                    self._drawn[stage, name] = found
+                if (stage, name) in self._drawn:
                     log_difference(self.recording, path, found)
                 if found.same:
                     continue
@@ -389,14 +389,15 @@ class Canvas:
 
     def _difference_layout(self, picture: Picture) -> Any:
         focus = self._focus_of(picture)
-        artifacts = self.pipeline.artifacts
         views: dict[str, list[Any]] = {}
-        for stage, own in self._differences.items():
-            for name, found in own.items():
-                if has_picture(found):
-                    unit = f", {artifacts[name].unit}" if artifacts[name].unit else ""
-                    view = difference_view(f"{DIFFERENCE}/{stage}/{name}", f"{name}{unit}", found)
-                    views.setdefault(stage, []).append(view)
+        for stage in self.pipeline.stages:
+            for artifact in stage.gives:
+                found = self._drawn.get((stage.name, artifact.name))
+                if found is not None:
+                    unit = f", {artifact.unit}" if artifact.unit else ""
+                    path = f"{DIFFERENCE}/{stage.name}/{artifact.name}"
+                    view = difference_view(path, f"{artifact.name}{unit}", found)
+                    views.setdefault(stage.name, []).append(view)
         summary = rrb.TextDocumentView(origin=f"{DIFFERENCE}/summary", name="what differs, A to B")
         tabs = [_grid(own, stage) for stage, own in views.items()]
         if not tabs:

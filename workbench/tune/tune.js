@@ -74,7 +74,11 @@ window.bench = (() => {
         },
         on_viewer_event: (text) => {
           const event = typeof text === "string" ? JSON.parse(text) : text;
-          if (event.type === "selection_change") emitEvent("viewer_selection", event.items);
+          if (event.type !== "selection_change" || !event.items.length) return;
+          emitEvent("viewer_selection", event.items);
+          // What is selected already tells of no further click: the selection is given up again.
+          const escape = { key: "Escape", code: "Escape", bubbles: false };
+          setTimeout(() => canvas.dispatchEvent(new KeyboardEvent("keydown", escape)), 60);
         },
       });
       await handle.start(canvas);
