@@ -243,7 +243,8 @@ def test_a_session_of_tuning(browser: Any, host: Host, bench: Command, tmp_path:
     tab.until(lambda: "cone_deg%3D41.5" in tab.address, "what was typed is taken")
     tab.page.get_by_role("button", name="Save").click()
     tab.page.locator(".save").get_by_role("button", name="Save").click()
-    assert "reason" in tab.page.locator(".save .refused").inner_text()
+    refused = tab.page.locator(".save .refused")
+    tab.until(lambda: "reason" in refused.inner_text(), "a reason is asked for")
     tab.page.locator(".save textarea").fill("the cone let in what lies beside")
     tab.page.locator(".save").get_by_role("button", name="Save").click()
     tuned = tmp_path / "scene.tuned.toml"
