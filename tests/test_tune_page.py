@@ -143,6 +143,8 @@ class Tab:
     def picture(self) -> np.ndarray:
         """The viewer's canvas as it is at rest."""
         self.page.mouse.move(5, 5)
+        # A message lies over the canvas for some seconds.
+        self.page.wait_for_function("!document.querySelector('.q-notification')")
         before = b""
         for _ in range(40):
             now = self.page.locator("#viewer").screenshot()
