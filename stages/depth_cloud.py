@@ -26,7 +26,9 @@ from stages.artifacts import (
 )
 from workbench.stage import (
     WARNINGS,
+    Cut,
     Finding,
+    Histogram,
     Inputs,
     Logged,
     Outputs,
@@ -396,6 +398,13 @@ class DepthCloud(Stage):
             return [*findings, Finding(says, given, None, "relative")]
         says = f"depth {1e3 * given['depth_m']:.2f} mm with confidence {given['confidence']:.3f}"
         return [*findings, Finding(says, given, None, "known")]
+
+    def histograms(self, artifacts: Mapping[str, Any], p: Any) -> list[Histogram]:
+        import numpy as np
+
+        counts, edges = np.histogram(artifacts["confidence"], bins=100, range=(0, 1))
+        least = Cut("unknown below", p.min_confidence, "min_confidence")
+        return [Histogram("confidence", edges, counts, [least])]
 
     def scorer(self) -> Scorer:
         from stages.dfd.score import DepthScorer

@@ -263,6 +263,35 @@ class Score:
     published: str = ""
 
 
+@dataclass(frozen=True)
+class Cut:
+    """A threshold that cuts a :class:`Histogram`, and which parameter moves it."""
+
+    name: str
+    value: float
+    """Where it lies, in the histogram's unit."""
+    parameter: str | None = None
+    """The stage's parameter that moves it; None where it only follows from others."""
+    setting: Callable[[float], Any] | None = None
+    """The parameter's value that brings the threshold to a place (or as near as it goes); None
+    where the parameter is the place itself."""
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How often each value occurs on this frame, and the thresholds that cut it."""
+
+    name: str
+    edges: np.ndarray
+    """[N + 1] bin edges, rising, in ``unit``."""
+    counts: np.ndarray
+    """[N] how many values lie in each bin."""
+    cuts: Sequence[Cut]
+    unit: str = ""
+    log_axis: bool = False
+    """Whether the values, all greater than 0, are shown on a logarithmic axis."""
+
+
 class Scorer:
     """Compares a stage's outputs with ground truth, frame by frame, in bounded memory.
 
@@ -293,7 +322,10 @@ class Scorer:
 
 @dataclass(frozen=True)
 class Logged:
-    """What :meth:`Stage.log` may look at: everything known of this frame so far."""
+    """What :meth:`Stage.log` may look at: everything known of this frame so far.
+
+    A live page logs a stage again when what it needs, gives or is set to has changed.
+    """
 
     artifacts: Mapping[str, Any]
     parameters: Any
@@ -339,6 +371,10 @@ class Stage:
         ``artifacts`` is everything known of the frame and ``p`` the stage's own ``Parameters``.
         What is told agrees with the artifacts to the last digit that is printed.
         """
+        return ()
+
+    def histograms(self, artifacts: Mapping[str, Any], p: Any) -> Sequence[Histogram]:
+        """The distributions that this stage's thresholds cut, for a page where they are moved."""
         return ()
 
     def scorer(self) -> Scorer | None:

@@ -7,6 +7,7 @@ the SDK's own ``spawn`` and ``serve`` functions cannot be told.
 
 from __future__ import annotations
 
+import importlib
 import os
 import shlex
 import shutil
@@ -29,6 +30,8 @@ from workbench.files import replacing
 
 LOOPBACK = "127.0.0.1"
 APPLICATION_ID = "workbench"
+
+WEB_VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 _START_SECONDS = 20.0
 _TOAST_SECONDS = 5.0
@@ -262,6 +265,100 @@ def take_screenshot(
             "no screenshot: Rerun's headless viewer needs a Vulkan driver "
             f"(Debian: mesa-vulkan-drivers): {error}"
         ) from error
+    finally:
+        child.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=5)
+        if child.poll() is None:
+            child.kill()
+
+
+def send_blueprint(recording: rr.RecordingStream, blueprint: Any) -> None:
+    """Send a layout, as ``RecordingStream.send_blueprint`` does, and leave nothing behind.
+
+    The SDK's own (0.41) keeps two threads and half a megabyte of each layout that was ever sent,
+    which a page that is used for hours would gather.
+    """
+    from rerun.recording_stream import RecordingStream
+
+    bindings: Any = importlib.import_module("rerun_bindings")
+    stream = RecordingStream._from_native(
+        bindings.new_blueprint(
+            application_id=rr.get_application_id(recording),
+            make_default=False,
+            make_thread_default=False,
+            default_enabled=True,
+        )
+    )
+    stream.set_time("blueprint", sequence=0)
+    blueprint.to_blueprint()._log_to_stream(stream)
+    held = rr.memory_recording(stream)
+    bindings.send_blueprint(held.storage, True, True, recording=recording.to_native())
+    stream.disconnect()
+    del held, stream
+    bindings.flush_and_cleanup_orphaned_recordings()
+
+
+@contextmanager
+def native_viewer(headless: bool = False) -> Iterator[tuple[int, subprocess.Popen[bytes]]]:
+    """A native viewer on a free port of loopback, with its process; ended with the block.
+
+    Raises :class:`DataError` where it cannot be opened.
+    """
+    port = free_port()
+    arguments = [rerun_program(), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
+    arguments += ["--memory-limit", "2GB", "--server-memory-limit", "256MB"]
+    if headless:
+        arguments += ["--headless", "--window-size", "1600x900"]
+    child = subprocess.Popen(
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        _await_port(port, child)
+        yield port, child
+    finally:
+        child.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=5)
+        if child.poll() is None:
+            child.kill()
+
+
+def unpack_web_viewer(folder: Path) -> None:
+    """Put the web viewer that the Rerun program carries (script and wasm) into ``folder``.
+
+    The program serves it on loopback for that moment and is then ended.  Raises
+    :class:`DataError` where it cannot be had.
+    """
+    import urllib.request
+
+    port, web_port = free_port(), free_port()
+    child = subprocess.Popen(
+        [
+            rerun_program(),
+            "--serve-web",
+            "--bind",
+            LOOPBACK,
+            "--port",
+            str(port),
+            "--web-viewer-port",
+            str(web_port),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        _await_port(web_port, child)
+        for name in WEB_VIEWER_FILES:
+            address = f"http://{LOOPBACK}:{web_port}/{name}"
+            with (
+                urllib.request.urlopen(address, timeout=_START_SECONDS) as answer,
+                (folder / name).open("wb") as file,
+            ):
+                shutil.copyfileobj(answer, file, 1 << 20)
+    except OSError as error:
+        raise DataError(f"Rerun's web viewer cannot be had: {error}") from error
     finally:
         child.terminate()
         with suppress(subprocess.TimeoutExpired):
