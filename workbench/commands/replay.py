@@ -22,7 +22,7 @@ def run(
     window: str,
 ) -> None:
     """Replay; exits with 1 if a stage failed on any frame or there was no frame."""
-    size = _window(window)
+    size = window_size(window)
     for flag, path in (("--save", save), ("--screenshot", screenshot), ("--json", json_report)):
         if path is not None:
             check_output(flag, path)
@@ -35,7 +35,7 @@ def run(
 
     native = not (web or save or screenshot)
     if native and not has_display():
-        native, save = False, _free_name(Path(f"{options.recording.stem}.rrd"))
+        native, save = False, free_name(Path(f"{options.recording.stem}.rrd"))
         check_output("--save", save)
         says = f"no display: saving {save} instead (open it with: {how_to_open(save)})"
         err.print(says, soft_wrap=True, markup=False)
@@ -75,7 +75,7 @@ def run(
     end(report)
 
 
-def _free_name(path: Path) -> Path:
+def free_name(path: Path) -> Path:
     """``path``, or the first of NAME-2, NAME-3, … that is not there: nobody asked to replace it."""
     number, free = 1, path
     while free.exists():
@@ -84,7 +84,8 @@ def _free_name(path: Path) -> Path:
     return free
 
 
-def _window(text: str) -> tuple[int, int]:
+def window_size(text: str) -> tuple[int, int]:
+    """``WIDTHxHEIGHT`` as two numbers.  Raises :class:`UsageError`."""
     width, x, height = text.partition("x")
     if not (x and width.isdigit() and height.isdigit() and int(width) and int(height)):
         raise UsageError(f"--window {text}: expected WIDTHxHEIGHT, as 1920x1080")
