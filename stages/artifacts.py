@@ -89,7 +89,9 @@ EDGE_STEP = Artifact("edge_step", "uint8", "H W", "", "which step decided on the
 EDGE_VALUE = Artifact("edge_value", "float32", "H W", "", "the value by which it decided")
 LINKING = Artifact("linking", doc="each iteration of the reconstruction, and every link")
 
-LABELS = Artifact("labels", "int32", "H W", "", "region of each pixel, 0 = none")
+LABELS = Artifact(
+    "labels", "int32", "H W", "", "region of each pixel, 0 = none", names_regions=True
+)
 REGIONS = Artifact("regions", doc="one row a region, a numpy structured array; see the stage")
 
 CANDIDATES = Artifact("candidates", doc="one row a candidate, a structured array; see the stage")

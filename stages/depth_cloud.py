@@ -24,7 +24,9 @@ from stages.artifacts import (
 )
 from workbench.stage import (
     WARNINGS,
+    Cut,
     Finding,
+    Histogram,
     Inputs,
     Logged,
     Outputs,
@@ -329,6 +331,13 @@ class DepthCloud(Stage):
         else:
             says = "unknown: outside the range in which depth is unique"
         return [Finding(says, values, "min_confidence")]
+
+    def histograms(self, artifacts: Mapping[str, Any], p: Any) -> list[Histogram]:
+        import numpy as np
+
+        counts, edges = np.histogram(artifacts["confidence"], bins=100, range=(0, 1))
+        least = Cut("unknown below", p.min_confidence, "min_confidence")
+        return [Histogram("confidence", edges, counts, [least])]
 
     def scorer(self) -> Scorer:
         from stages.dfd.score import DepthScorer

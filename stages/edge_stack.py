@@ -20,7 +20,9 @@ from stages.artifacts import (
 from stages.edges.presets import PRESETS
 from workbench.stage import (
     WARNINGS,
+    Cut,
     Finding,
+    Histogram,
     Inputs,
     Logged,
     Outputs,
@@ -209,6 +211,27 @@ class EdgeStackStage(Stage):
         else:
             says = f"gradient {strength:.1f} is over low {low:.1f}; its segment reaches {peak:.1f}"
         return [Finding(says, values, "max_ratio")]
+
+    def histograms(self, artifacts: Mapping[str, Any], p: Any) -> list[Histogram]:
+        import numpy as np
+
+        found = artifacts["edge_choice"]
+        stack = found.stack
+        # Of the pixels that can be edges: the rest of the image would drown them.
+        counts, edges = np.histogram(
+            stack.strength[found.gradient.thin],
+            bins=120,
+            range=(0, 1.25 * float(stack.thresholds[-1])),
+        )
+        highest, middle, _ = stack.high_thresholds
+        lines = [
+            Cut("search from", p.lowest, "lowest"),
+            Cut("low", stack.low_threshold, "max_ratio", stack.ratio_for_low),
+            Cut("medium", middle),
+            Cut("greatest", highest, "greatest"),
+        ]
+        unit = "σ of the noise" if p.noise_units else "grey levels"
+        return [Histogram("gradient along its ridges", edges, counts, lines, unit)]
 
     def scorer(self) -> Scorer:
         from stages.edges.scorers import EdgeScorer

@@ -206,6 +206,35 @@ def export(
 
 
 @app.command()
+def tune(
+    recording: Rec,
+    port: Annotated[
+        int | None, typer.Option(help="The page's port on loopback; a free one if not given.")
+    ] = None,
+    browser: Annotated[
+        bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")
+    ] = True,
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Turn the stages' knobs beside the viewer; only what is downstream runs again."""
+    from workbench.commands import tune as command
+
+    options = _options(
+        recording, calibration, models, preset, config, assignments, topic, frames, until, plugin
+    )
+    command.run(options, port, browser, as_json)
+
+
+@app.command()
 def evaluate(
     recording: Rec,
     calibration: Calibration = None,

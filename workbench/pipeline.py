@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import time
 import warnings as python_warnings
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -93,7 +93,8 @@ class ResultStore:
 class Pipeline:
     """Stages in an order in which each finds what it needs.
 
-    ``until`` keeps only that stage and what it needs.  ``resources`` maps the names of
+    ``until`` keeps only that stage and what it needs; ``known`` still holds all, whose parameters
+    the settings carry.  ``resources`` maps the names of
     :class:`Resource` artifacts to files.  Raises :class:`StageError` if the stages do not fit
     together, or a resource cannot be read.
     """
@@ -107,6 +108,7 @@ class Pipeline:
         store: ResultStore | None = None,
     ) -> None:
         self.stages = ordered(stages, until)
+        self.known = MappingProxyType(dict(stages))
         self.settings = settings
         self.store = store or ResultStore()
         self.resources: dict[str, tuple[Any, str]] = {}
@@ -153,51 +155,77 @@ class Pipeline:
 
     def run(self, frame: Frame) -> Run:
         """The frame through all stages.  A stage's exception never hides the others' results."""
+        return deque(self.steps(frame), maxlen=1).pop()
+
+    def steps(self, frame: Frame) -> Iterator[Run]:
+        """The same one stage at a time: the run before the first stage, and after each.
+
+        Who shows results live shows each as it comes, and may leave when a newer one is wanted.
+        """
         artifacts: dict[str, Any] = {}
         digests: dict[str, str] = {}
         self._take_sources(frame, artifacts, digests)
         failures: list[Failure] = []
-        failed_givers: dict[str, str] = {}
         warnings: list[str] = []
         stage_ms: dict[str, float] = {}
         computed: set[str] = set()
+
+        def so_far() -> Run:
+            return Run(
+                frame,
+                MappingProxyType(dict(artifacts)),
+                MappingProxyType(dict(digests)),
+                tuple(failures),
+                tuple(warnings),
+                MappingProxyType(dict(stage_ms)),
+                frozenset(computed),
+            )
+
+        yield so_far()
+        failed_givers: dict[str, str] = {}
         for stage in self.stages:
-            lacking = [n.name for n in stage.needs if n.required and n.name not in artifacts]
-            if lacking:
-                failure = _lacking(stage, lacking, failed_givers)
+            failure = self._step(
+                stage, artifacts, digests, failed_givers, warnings, stage_ms, computed
+            )
+            if failure is not None:
                 failures.append(failure)
                 culprit = failure.blocked_by or stage.name
                 failed_givers.update((a.name, culprit) for a in stage.gives)
-                continue
-            parameters = self.settings.parameters[stage.name]
-            key = digest_of(
-                [stage.name, self._code[stage.name], parameters.model_dump_json()]
-                + [f"{n.name} {digests.get(n.name)}" for n in stage.needs]
-            )
-            result = self.store.get(key)
-            if result is None:
-                inputs = {n.name: artifacts.get(n.name) for n in stage.needs}
-                try:
-                    result = self._compute(stage, inputs, parameters)
-                except Exception as error:
-                    failures.append(Failure(stage.name, one_line(error)))
-                    failed_givers.update((a.name, stage.name) for a in stage.gives)
-                    continue
-                self.store.put(key, result)
-                computed.add(stage.name)
-            artifacts.update(result.outputs)
-            digests.update((a.name, digest_of([key, a.name])) for a in stage.gives)
-            warnings += [f"{stage.name}: {says}" for says in result.warnings]
-            stage_ms[stage.name] = result.milliseconds
-        return Run(
-            frame,
-            MappingProxyType(artifacts),
-            MappingProxyType(digests),
-            tuple(failures),
-            tuple(warnings),
-            MappingProxyType(stage_ms),
-            frozenset(computed),
+            yield so_far()
+
+    def _step(
+        self,
+        stage: Stage,
+        artifacts: dict[str, Any],
+        digests: dict[str, str],
+        failed_givers: Mapping[str, str],
+        warnings: list[str],
+        stage_ms: dict[str, float],
+        computed: set[str],
+    ) -> Failure | None:
+        """Run one stage, or take its kept result, and add what came of it; or say why not."""
+        lacking = [n.name for n in stage.needs if n.required and n.name not in artifacts]
+        if lacking:
+            return _lacking(stage, lacking, failed_givers)
+        parameters = self.settings.parameters[stage.name]
+        key = digest_of(
+            [stage.name, self._code[stage.name], parameters.model_dump_json()]
+            + [f"{n.name} {digests.get(n.name)}" for n in stage.needs]
         )
+        result = self.store.get(key)
+        if result is None:
+            inputs = {n.name: artifacts.get(n.name) for n in stage.needs}
+            try:
+                result = self._compute(stage, inputs, parameters)
+            except Exception as error:
+                return Failure(stage.name, one_line(error))
+            self.store.put(key, result)
+            computed.add(stage.name)
+        artifacts.update(result.outputs)
+        digests.update((a.name, digest_of([key, a.name])) for a in stage.gives)
+        warnings += [f"{stage.name}: {says}" for says in result.warnings]
+        stage_ms[stage.name] = result.milliseconds
+        return None
 
     def _take_sources(
         self, frame: Frame, artifacts: dict[str, Any], digests: dict[str, str]

@@ -81,7 +81,10 @@ class Session:
 
     def provenance(self) -> dict[str, Any]:
         """What identifies a result: code, parameters, input and what it ran on."""
-        pipeline = self.pipeline
+        return self.provenance_of(self.pipeline)
+
+    def provenance_of(self, pipeline: Pipeline) -> dict[str, Any]:
+        """The same for this session's pipeline under other settings."""
         return {
             "bench": bench_version(),
             "recording": {"name": self.recording.path.name, "digest": self.recording.digest},

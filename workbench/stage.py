@@ -59,6 +59,8 @@ class Artifact:
     unit: str = ""
     doc: str = ""
     required: bool = True
+    names_regions: bool = field(default=False, kw_only=True)
+    """Whether its integers only name regions, so that renumbering them changes nothing."""
 
     def optional(self) -> Self:
         """The same artifact as a need that may be absent (its value is then None)."""
@@ -211,11 +213,24 @@ def knob(
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence of a pixel's story: a value, the threshold that it met, and what followed."""
+    """One sentence of a pixel's story: a value, the threshold that it met, and what followed.
+
+    ``values`` are the numbers of the sentence, exactly as they are: a key that is an artifact with
+    axes ``H W`` holds that artifact's value at the pixel, so that a reader can check the sentence.
+    ``parameter`` is the knob of the same stage that the value was held against, or that decided.
+
+    ``verdict`` is the state that the pixel is in from here on, in a word or two without numbers
+    (``"edge"``, ``"no edge"``): a stage's verdict is its last finding's that has one.  A changed
+    verdict is what ``workbench why`` looks for, so two pixels that fare alike have the same.
+    ``about`` says what the verdict is on where that is not this very pixel, such as the region
+    beside a line: what is asked of a pixel is the last verdict on the pixel itself.
+    """
 
     says: str
     values: Mapping[str, Any] = field(default_factory=dict)
     parameter: str | None = None
+    verdict: str = ""
+    about: str = ""
 
 
 @dataclass(frozen=True)
@@ -227,6 +242,33 @@ class Score:
     unit: str = ""
     coverage: float | None = None
     note: str = ""
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A threshold that cuts a :class:`Histogram`, and which parameter moves it."""
+
+    name: str
+    value: float
+    """Where it lies, in the histogram's unit."""
+    parameter: str | None = None
+    """The stage's parameter that moves it; None where it only follows from others."""
+    setting: Callable[[float], Any] | None = None
+    """The parameter's value that brings the threshold to a place (or as near as it goes); None
+    where the parameter is the place itself."""
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How often each value occurs on this frame, and the thresholds that cut it."""
+
+    name: str
+    edges: np.ndarray
+    """[N + 1] bin edges, rising, in ``unit``."""
+    counts: np.ndarray
+    """[N] how many values lie in each bin."""
+    cuts: Sequence[Cut]
+    unit: str = ""
 
 
 class Scorer:
@@ -246,7 +288,10 @@ class Scorer:
 
 @dataclass(frozen=True)
 class Logged:
-    """What :meth:`Stage.log` may look at: everything known of this frame so far."""
+    """What :meth:`Stage.log` may look at: everything known of this frame so far.
+
+    A live page logs a stage again when what it needs, gives or is set to has changed.
+    """
 
     artifacts: Mapping[str, Any]
     parameters: Any
@@ -285,7 +330,15 @@ class Stage:
         return ()
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> Sequence[Finding]:
-        """The story of pixel (x, y) in this stage."""
+        """The story of pixel (x, y) in this stage, in order: values, thresholds, verdict, reason.
+
+        ``artifacts`` is everything known of the frame and ``p`` the stage's own ``Parameters``.
+        What is told agrees with the artifacts to the last digit that is printed.
+        """
+        return ()
+
+    def histograms(self, artifacts: Mapping[str, Any], p: Any) -> Sequence[Histogram]:
+        """The distributions that this stage's thresholds cut, for a page where they are moved."""
         return ()
 
     def scorer(self) -> Scorer | None:

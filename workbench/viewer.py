@@ -30,6 +30,8 @@ from workbench.files import replacing
 LOOPBACK = "127.0.0.1"
 APPLICATION_ID = "workbench"
 
+WEB_VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
+
 _START_SECONDS = 20.0
 _TOAST_SECONDS = 5.0
 _SETTLE_SECONDS = 20.0
@@ -240,6 +242,49 @@ def take_screenshot(rrd: Path, picture: Path, window: tuple[int, int]) -> None:
             "no screenshot: Rerun's headless viewer needs a Vulkan driver "
             f"(Debian: mesa-vulkan-drivers): {error}"
         ) from error
+    finally:
+        child.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=5)
+        if child.poll() is None:
+            child.kill()
+
+
+def unpack_web_viewer(folder: Path) -> None:
+    """Put the web viewer that the Rerun program carries (script and wasm) into ``folder``.
+
+    The program serves it on loopback for that moment and is then ended.  Raises
+    :class:`DataError` where it cannot be had.
+    """
+    import urllib.request
+
+    port, web_port = free_port(), free_port()
+    child = subprocess.Popen(
+        [
+            rerun_program(),
+            "--serve-web",
+            "--bind",
+            LOOPBACK,
+            "--port",
+            str(port),
+            "--web-viewer-port",
+            str(web_port),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        _await_port(web_port, child)
+        for name in WEB_VIEWER_FILES:
+            address = f"http://{LOOPBACK}:{web_port}/{name}"
+            with (
+                urllib.request.urlopen(address, timeout=_START_SECONDS) as answer,
+                (folder / name).open("wb") as file,
+            ):
+                shutil.copyfileobj(answer, file, 1 << 20)
+    except OSError as error:
+        raise DataError(f"Rerun's web viewer cannot be had: {error}") from error
     finally:
         child.terminate()
         with suppress(subprocess.TimeoutExpired):

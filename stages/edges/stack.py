@@ -326,6 +326,21 @@ class EdgeStack:
     ratio: F64
     upheld: bool
 
+    def ratio_for_low(self, wanted: float) -> float:
+        """The ``max_ratio`` that puts the low threshold at ``wanted``, or as near as it can lie.
+
+        The low threshold is the first whose ratio is under ``max_ratio``: it can only lie where
+        the ratio is less than everywhere before.
+        """
+        ratio = np.where(np.isnan(self.ratio), np.inf, self.ratio)
+        before = np.concatenate([[np.inf], np.minimum.accumulate(ratio)[:-1]])
+        places = np.flatnonzero(ratio < before)
+        if not places.size:
+            return float("inf")
+        k = places[np.argmin(np.abs(self.thresholds[places] - wanted))]
+        # Any value over this ratio and not over the least before it does; the middle is safest.
+        return float(0.5 * (ratio[k] + before[k])) if np.isfinite(before[k]) else float("inf")
+
 
 def build_stack(
     strength: F32,

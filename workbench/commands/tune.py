@@ -1,0 +1,70 @@
+"""``workbench tune``: knobs beside the viewer, on one page that is served on loopback."""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import webbrowser
+from contextlib import suppress
+from pathlib import Path
+
+from workbench import interrupts
+from workbench.console import err
+from workbench.errors import DataError, UsageError
+from workbench.report import to_json
+from workbench.session import Options, Session
+
+_MOST_PORTS = 65535
+
+
+def run(options: Options, port: int | None, browser: bool, as_json: bool) -> None:
+    """Serve until Ctrl-C."""
+    if port is not None and not 1 <= port <= _MOST_PORTS:
+        raise UsageError(f"--port {port}: expected 1 to {_MOST_PORTS}")
+    session = Session.open(options)
+    if session.count() == 0:
+        raise DataError(f"{options.recording}: no frame in it, or in --frames")
+    from workbench.viewer import free_port, has_display
+
+    if port is None:
+        port = free_port()
+    else:
+        _check_free(port)
+    err.print("starting …", style="dim")
+    from workbench.tune.app import LivePage
+    from workbench.tune.frames import SessionFrames
+    from workbench.tune.live import LiveBench
+    from workbench.tune.page import PageOptions
+
+    bench = LiveBench(session.pipeline, SessionFrames(session), session.provenance_of)
+    page_options = PageOptions(
+        title="tune",
+        subtitle=session.recording.path.name,
+        save_to=Path(f"{options.recording.stem}.tuned.toml").absolute(),
+    )
+    with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
+        page = LivePage(bench, page_options, Path(folder), port)
+
+        def ready() -> None:
+            if as_json:
+                print(to_json({"url": page.url, "recording": str(options.recording)}), flush=True)
+            else:
+                err.print(f"open {page.url}", soft_wrap=True, markup=False)
+                err.print("serving until Ctrl-C", style="dim")
+            if browser and has_display():
+                webbrowser.open(page.url)
+
+        with suppress(KeyboardInterrupt):
+            page.serve(ready)
+            interrupts.check()
+
+
+def _check_free(port: int) -> None:
+    from workbench.viewer import LOOPBACK
+
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, port))
+        except OSError as error:
+            raise DataError(f"--port {port}: {error.strerror}") from error
