@@ -323,6 +323,9 @@ def teach(
         Path | None, typer.Option(help="Take a picture (PNG) of the lesson; needs no screen.")
     ] = None,
     assignments: Set = None,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Serve the page and print its address only.")
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Check what the lessons claim and print it as JSON.")
     ] = False,
@@ -333,7 +336,7 @@ def teach(
     """A course of short lessons: a text beside live pictures and a few knobs."""
     from workbench.commands import teach as command
 
-    command.run(lesson, listing, save, screenshot, assignments or [], as_json, window)
+    command.run(lesson, listing, save, screenshot, assignments or [], no_browser, as_json, window)
 
 
 def main() -> None:

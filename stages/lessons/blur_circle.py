@@ -60,7 +60,8 @@ class Lens(Stage):
 
         rig = Rig(f_number=parameters.f_number, near_focus_mm=parameters.near_focus_mm)
         circles = {
-            channel: 1e3 * float(rig.blur_mm(channel, parameters.distance_mm))
+            # Rounded to a nanometre, or a point in focus would show a blur of -0.
+            channel: round(1e3 * float(rig.blur_mm(channel, parameters.distance_mm)), 3) + 0.0
             for channel in ("near", "far")
         }
         return {"lesson_rig": rig, "blur_circles_um": circles}
@@ -96,8 +97,8 @@ class Lens(Stage):
                 Curve((u, u), (-top, top), "", BOTH_COLOUR, thin=True),
             ],
             [
-                Mark(u, circles["near"], f"{circles['near']:+.0f} µm", NEAR_COLOUR),
-                Mark(u, circles["far"], f"{circles['far']:+.0f} µm", FAR_COLOUR),
+                Mark(u, circles["near"], f"{_signed(circles['near'])} µm", NEAR_COLOUR),
+                Mark(u, circles["far"], f"{_signed(circles['far'])} µm", FAR_COLOUR),
             ],
         )
 
@@ -221,7 +222,8 @@ def _log_meeting(recording: Any, path: str, rig: Any, u: float, circles: dict[st
         radii += [0.4, 1.6]
         pixels = abs(circles[channel]) / 1e3 / rig.pixel_pitch_mm
         place = (x + (18 if channel == "near" else -18), -66.0)
-        texts.append((place, f"{channel}: {circles[channel]:+.0f} µm = {pixels:.1f} px", colour))
+        says = f"{channel}: {_signed(circles[channel])} µm = {pixels:.1f} px"
+        texts.append((place, says, colour))
     recording.log(f"{path}/sensors", rr.LineStrips2D(strips, colors=colours, radii=radii))
     x = (v - middle) * _MEETING_ALONG
     if abs(x) < 100:
@@ -230,6 +232,12 @@ def _log_meeting(recording: Any, path: str, rig: Any, u: float, circles: dict[st
     else:
         recording.log(f"{path}/focus", rr.Clear(recursive=False))
     log_texts(recording, f"{path}/texts", texts)
+
+
+def _signed(value: float) -> str:
+    """A number with its sign, of which 0 has none."""
+    rounded = round(value)
+    return f"{rounded:+d}" if rounded else "0"
 
 
 def _circle(channel: str) -> Any:

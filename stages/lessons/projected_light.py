@@ -31,7 +31,10 @@ every surface the same strong, known texture at one frequency, chosen where blur
 
 Turn `plane.pattern` to 0: the projector becomes a plain lamp. The focus maps fall to what noise
 gives, the confidence to nothing, and the depth is *unknown* (grey), which is the honest answer.
-Then print something on the plane (`plane.texture`): some depth comes back, patchy and uncertain.
+
+Then print something on the plane (`plane.texture`): there is something to blur again, and the focus
+maps wake up, patchily. *Passive* depth from defocus works with that. This sensor, calibrated on its
+own stripes, still refuses: a contrast that it does not know could be any depth.
 """
 
 _TRUE_RANGE_M = (0.700, 0.806)
@@ -138,7 +141,7 @@ LESSON = Lesson(
         ),
         Claim(
             "With the pattern off, print a texture on the plane, 0 to 0.5: the focus measure comes "
-            "back to what blur can be read from.",
+            "back, for there is something to blur again.",
             {"plane.pattern": 0.0, "plane.texture": 0.0},
             {"plane.pattern": 0.0, "plane.texture": 0.5},
             "focus measure, near",

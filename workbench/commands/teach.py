@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
+import webbrowser
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +27,7 @@ def run(
     save: Path | None,
     screenshot: Path | None,
     assignments: Sequence[str],
+    no_browser: bool,
     as_json: bool,
     window: str,
 ) -> None:
@@ -42,7 +46,7 @@ def run(
         _list(chosen, as_json)
         return
     if save is None and screenshot is None and not as_json:
-        _live(chosen[0], assignments)
+        _live(lessons, chosen[0], assignments, browser=not no_browser)
         return
     seen: dict[int, list[Seen]] = {}
     if screenshot is not None:
@@ -163,13 +167,38 @@ def _identity(lessons: Sequence[Lesson]) -> str:
     return digest_of([lesson.page() for lesson in lessons])
 
 
-def _live(first: Lesson, assignments: Sequence[str]) -> None:
-    """The lesson as a file, where there is no display."""
-    from workbench.viewer import how_to_open
+def _live(
+    lessons: Sequence[Lesson],
+    first: Lesson,
+    assignments: Sequence[str],
+    browser: bool,
+) -> None:
+    """The page; where there is neither a display nor a wish for none, the lesson as a file."""
+    from workbench.viewer import free_port, has_display, how_to_open
 
-    path = free_name(Path(f"lesson-{first.slug}.rrd"))
-    check_output("--save", path)
-    says = f"no display: saving {path} instead (open it with: {how_to_open(path)})"
-    err.print(says, soft_wrap=True, markup=False)
-    _save([first], assignments, path)
-    out.print(f"wrote {path}", soft_wrap=True, markup=False)
+    if browser and not has_display():
+        path = free_name(Path(f"lesson-{first.slug}.rrd"))
+        check_output("--save", path)
+        says = (
+            f"no display: saving {path} instead (open it with: {how_to_open(path)}); "
+            "--no-browser serves the page"
+        )
+        err.print(says, soft_wrap=True, markup=False)
+        _save([first], assignments, path)
+        out.print(f"wrote {path}", soft_wrap=True, markup=False)
+        return
+    err.print("starting …", style="dim")
+    from workbench.teach.page import CoursePage
+
+    with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
+        page = CoursePage(lessons, first, assignments, Path(folder), free_port())
+
+        def ready() -> None:
+            err.print(f"open {page.url}", soft_wrap=True, markup=False)
+            err.print("serving until Ctrl-C", style="dim")
+            if browser:
+                webbrowser.open(page.url)
+
+        with suppress(KeyboardInterrupt):
+            page.serve(ready)
+            interrupts.check()

@@ -6,6 +6,7 @@ window.bench = (() => {
   let socket = null;
   let pieces = 0;
   const channel = "bench";
+  let stream = "/stream";
 
   const say = (text, hidden) => {
     const cover = document.getElementById("viewer-cover");
@@ -16,7 +17,7 @@ window.bench = (() => {
 
   const feed = () => {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    socket = new WebSocket(`${scheme}://${location.host}/stream`);
+    socket = new WebSocket(`${scheme}://${location.host}${stream}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => {
       handle.send_rrd_to_channel(channel, new Uint8Array(event.data));
@@ -40,7 +41,8 @@ window.bench = (() => {
     };
   };
 
-  const start = async (version) => {
+  const start = async (version, path = "/stream") => {
+    stream = path;
     const canvas = document.getElementById("viewer");
     try {
       await wasm_bindgen({ module_or_path: `/viewer/${version}/re_viewer_bg.wasm` });
@@ -48,6 +50,7 @@ window.bench = (() => {
         url: [],
         hide_welcome_screen: true,
         persist: false,
+        theme: "dark",
         panel_state_overrides: {
           top: "Hidden", blueprint: "Hidden", selection: "Hidden", time: "Hidden",
         },
