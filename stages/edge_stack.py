@@ -218,20 +218,22 @@ class EdgeStackStage(Stage):
         found = artifacts["edge_choice"]
         stack = found.stack
         # Of the pixels that can be edges: the rest of the image would drown them.
-        counts, edges = np.histogram(
-            stack.strength[found.gradient.thin],
-            bins=120,
-            range=(0, 1.25 * float(stack.thresholds[-1])),
-        )
+        strength = stack.strength[found.gradient.thin]
         highest, middle, _ = stack.high_thresholds
-        lines = [
-            Cut("search from", p.lowest, "lowest"),
+        # The axis follows the image, so that it stays where it is while a threshold is dragged.
+        least, top = 1.0, 100.0
+        if (strength > 0).any():
+            least, top = np.percentile(strength[strength > 0], [0, 99.9])
+        least, top = min(least, 0.8 * p.lowest), max(top, 1.5 * highest)
+        counts, edges = np.histogram(strength, bins=np.geomspace(least, top, 100))
+        cuts = [
+            Cut("from", p.lowest, "lowest", lambda place: min(place, 0.9 * p.greatest)),
             Cut("low", stack.low_threshold, "max_ratio", stack.ratio_for_low),
             Cut("medium", middle),
-            Cut("greatest", highest, "greatest"),
+            Cut("greatest", highest, "greatest", lambda place: max(place, 1.1 * p.lowest)),
         ]
         unit = "σ of the noise" if p.noise_units else "grey levels"
-        return [Histogram("gradient along its ridges", edges, counts, lines, unit)]
+        return [Histogram("gradient along its ridges", edges, counts, cuts, unit, log_axis=True)]
 
     def scorer(self) -> Scorer:
         from stages.edges.scorers import EdgeScorer

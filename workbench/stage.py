@@ -269,6 +269,8 @@ class Histogram:
     """[N] how many values lie in each bin."""
     cuts: Sequence[Cut]
     unit: str = ""
+    log_axis: bool = False
+    """Whether the values, all greater than 0, are shown on a logarithmic axis."""
 
 
 class Scorer:

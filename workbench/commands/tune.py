@@ -7,12 +7,16 @@ import tempfile
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from workbench import interrupts
 from workbench.console import err
 from workbench.errors import DataError, UsageError
 from workbench.report import to_json
 from workbench.session import Options, Session
+
+if TYPE_CHECKING:
+    from workbench.tune.app import LivePage
 
 _MOST_PORTS = 65535
 
@@ -30,20 +34,9 @@ def run(options: Options, port: int | None, browser: bool, as_json: bool) -> Non
         port = free_port()
     else:
         _check_free(port)
-    err.print("starting …", style="dim")
-    from workbench.tune.app import LivePage
-    from workbench.tune.frames import SessionFrames
-    from workbench.tune.live import LiveBench
-    from workbench.tune.page import PageOptions
-
-    bench = LiveBench(session.pipeline, SessionFrames(session), session.provenance_of)
-    page_options = PageOptions(
-        title="tune",
-        subtitle=session.recording.path.name,
-        save_to=Path(f"{options.recording.stem}.tuned.toml").absolute(),
-    )
     with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
-        page = LivePage(bench, page_options, Path(folder), port)
+        err.print("starting …", style="dim")
+        page = page_of(session, Path(folder), port)
 
         def ready() -> None:
             if as_json:
@@ -57,6 +50,23 @@ def run(options: Options, port: int | None, browser: bool, as_json: bool) -> Non
         with suppress(KeyboardInterrupt):
             page.serve(ready)
             interrupts.check()
+
+
+def page_of(session: Session, folder: Path, port: int) -> LivePage:
+    """The page of a session, not yet served."""
+    from workbench.tune.app import LivePage
+    from workbench.tune.frames import SessionFrames
+    from workbench.tune.live import LiveBench
+    from workbench.tune.page import PageOptions
+
+    bench = LiveBench(session.pipeline, SessionFrames(session), session.provenance_of)
+    path = session.recording.path
+    options = PageOptions(
+        title="tune",
+        subtitle=path.name,
+        save_to=Path(f"{path.stem}.tuned.toml").absolute(),
+    )
+    return LivePage(bench, options, folder, port)
 
 
 def _check_free(port: int) -> None:

@@ -307,7 +307,7 @@ class Canvas:
         )
 
     def _views(self, stage: str, part: Part, run: Run) -> list[Any]:
-        """A stage's views on its entities under the part's prefix; none where it has no pictures."""
+        """A stage's views on its entities under the part's prefix; none without pictures."""
         if stage not in self._layers[part.prefix].sound:
             return []
         found = next(s for s in self.pipeline.stages if s.name == stage)
@@ -356,8 +356,7 @@ class Canvas:
         below = [*self._recorded()[:1], *(view for _, view in sorted(strip, key=lambda s: s[0]))]
         if not own:
             return self._row(below, "around it")
-        columns = min(3, len(own)) if len(own) != 4 else 2
-        large = rrb.Grid(*own, grid_columns=columns, name=focus)
+        large = _grid(own, focus)
         if not below:
             return large
         return rrb.Vertical(large, rrb.Horizontal(*below), row_shares=[3.2, 1])
@@ -386,10 +385,7 @@ class Canvas:
                     view = difference_view(f"{DIFFERENCE}/{stage}/{name}", f"{name}{unit}", found)
                     views.setdefault(stage, []).append(view)
         summary = rrb.TextDocumentView(origin=f"{DIFFERENCE}/summary", name="what differs, A to B")
-        tabs = [
-            rrb.Grid(*own, grid_columns=min(3, len(own)) if len(own) != 4 else 2, name=stage)
-            for stage, own in views.items()
-        ]
+        tabs = [_grid(own, stage) for stage, own in views.items()]
         if not tabs:
             return summary
         stages = list(views)
@@ -412,6 +408,16 @@ def _leaves_of(view: Any) -> list[Any]:
     if isinstance(view, rrb.Container):
         return [leaf for inner in view.contents for leaf in _leaves_of(inner)]
     return [view]
+
+
+def _grid(views: Sequence[Any], name: str) -> Any:
+    """Views in rows without a hole: of five the last, a stage's result, stands large."""
+    if len(views) == 5:
+        return rrb.Horizontal(
+            rrb.Grid(*views[:4], grid_columns=2), views[4], column_shares=[1.15, 1], name=name
+        )
+    columns = 2 if len(views) == 4 else min(3, len(views))
+    return rrb.Grid(*views, grid_columns=columns, name=name)
 
 
 def _is_flat(view: Any) -> bool:

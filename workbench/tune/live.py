@@ -408,7 +408,7 @@ class LiveBench:
         with self._lock:
             return None if self._shown.run is None else self._shown.run.frame.index
 
-    # -- asking about a pixel -----------------------------------------------------------------------
+    # -- asking about a pixel ---------------------------------------------------------------------
 
     def story(self, x: int, y: int, layer: str = "") -> Story:
         """What every stage tells of pixel (x, y) of the run that is shown under ``layer``.
@@ -536,19 +536,23 @@ class LiveBench:
     # -- the state, under the lock ----------------------------------------------------------------
 
     def _take(self, settings: Settings, settled: bool) -> None:
-        if settings == self._settings:
-            # The release of a knob that was dragged to where it is now.
-            self._settled = self._settled or settled
-            return
-        if self._settled:
-            del self._history[self._place + 1 :]
-            self._history.append(settings)
-            del self._history[: max(0, len(self._history) - _HISTORY)]
-            self._place = len(self._history) - 1
-        else:
-            self._history[self._place] = settings
-        self._settled = settled
-        self._ask()
+        """Make these the settings.  Those of one drag, until it is settled, are one step."""
+        if settings != self._settings:
+            if self._settled:
+                del self._history[self._place + 1 :]
+                self._history.append(settings)
+                del self._history[: max(0, len(self._history) - _HISTORY)]
+                self._place = len(self._history) - 1
+                self._settled = False
+            else:
+                self._history[self._place] = settings
+            self._ask()
+        if settled and not self._settled:
+            self._settled = True
+            if self._place and self._history[self._place - 1] == settings:
+                # Dragged back to where it was: there is nothing to undo.
+                del self._history[self._place]
+                self._place -= 1
 
     def _step(self, by: int) -> None:
         with self._lock:

@@ -90,7 +90,8 @@ class _Page:
         ui.colors(primary="#4a9eff", dark="#0d1011", dark_page="#0d1011", accent="#ff8a3d")
         version = self.options.viewer_version
         ui.add_head_html(
-            f'<script src="/viewer/{version}/re_viewer.js"></script><script src="/tune.js"></script>'
+            f'<script src="/viewer/{version}/re_viewer.js"></script>'
+            '<script src="/tune.js"></script>'
         )
         ui.query(".nicegui-content").classes("page")
         with ui.element("div").classes("bar"):
@@ -122,7 +123,7 @@ class _Page:
         self.preset = ui.select(presets, value=presets[0], label="preset").props(
             "dense outlined options-dense"
         )
-        self.preset.classes("preset").mark("preset")
+        self.preset.classes("preset")
         self.preset.on(
             "update:model-value",
             lambda: self._tried(lambda: self.bench.choose_preset(str(self.preset.value))),
@@ -137,7 +138,7 @@ class _Page:
                     "dense flat no-caps"
                 ).classes("textual").tooltip(f"Keep the settings as they are now as {name}")
             self.views = ui.toggle(_VIEWS, value="live").props("dense no-caps unelevated")
-            self.views.classes("views").mark("views")
+            self.views.classes("views")
             self.views.on(
                 "update:model-value",
                 lambda: self._tried(lambda: self.bench.show(str(self.views.value))),
@@ -188,7 +189,7 @@ class _Page:
             self.play.props("dense flat round size=sm").tooltip("Play")
             last = max(len(self.bench.frames) - 1, 0)
             self.frame = ui.slider(min=0, max=max(last, 1), step=1, value=0).classes("frames")
-            self.frame.props("dense snap").mark("frame")
+            self.frame.props("dense snap")
             if last == 0:
                 self.frame.disable()
             self.frame.on("update:model-value", self._to_frame, throttle=_DRAG_SECONDS)
@@ -267,9 +268,9 @@ class _Page:
                 "What was changed, why, and where it comes from; --config reads it back."
             ).classes("hint")
             path = ui.input("file", value=str(self.options.save_to)).props("dense outlined")
-            path.classes("wide").mark("save-path")
+            path.classes("wide")
             reason = ui.textarea("reason (needed)").props("dense outlined autogrow autofocus")
-            reason.classes("wide").mark("save-reason")
+            reason.classes("wide")
             trouble = ui.label("").classes("refused")
 
             def write() -> None:
@@ -290,7 +291,7 @@ class _Page:
 
             with ui.row().classes("wide justify-end"):
                 ui.button("Cancel", on_click=dialog.close).props("flat no-caps")
-                ui.button("Save", on_click=write).props("unelevated no-caps").mark("save-write")
+                ui.button("Save", on_click=write).props("unelevated no-caps")
         dialog.on("hide", dialog.delete)
         dialog.open()
 
@@ -429,14 +430,14 @@ class _StagePanel:
         self.rows: list[_KnobRow] = []
         self.charts: list[ui.echart] = []
         self.drawn: Any = None
-        self.expansion = ui.expansion().classes("stage").props("dense").mark(f"stage-{name}")
+        self.expansion = ui.expansion().classes("stage").props("dense")
         with self.expansion.add_slot("header"), ui.element("div").classes("stage-head"):
             self.dot = ui.element("span").classes("dot")
             ui.label(name).classes("stage-name")
             self.changed = ui.label("").classes("changed-count")
             ui.element("div").classes("grow")
-            self.ran = ui.label("").classes("ran").mark(f"ran-{name}")
-            self.time = ui.label("").classes("time").mark(f"time-{name}")
+            self.ran = ui.label("").classes("ran")
+            self.time = ui.label("").classes("time")
         with self.expansion:
             self.failure = ui.label("").classes("failure")
             self.failure.set_visibility(False)
@@ -486,6 +487,9 @@ class _StagePanel:
             return
         self.drawn = run
         histograms = self.page.bench.histograms(self.name)
+        if not histograms and self.charts:
+            # A stage that fails for now keeps the lines by which it was brought there.
+            return
         if len(histograms) != len(self.charts):
             self.chart_box.clear()
             with self.chart_box:
@@ -546,11 +550,10 @@ class _KnobRow:
                     on_click=lambda: page._tried(lambda: page.bench.reset(self.address)),
                 )
                 self.reset.props("dense flat round size=xs").classes("knob-reset")
-                self.reset.mark(f"reset-{self.address}")
+                self.reset
                 ui.element("div").classes("grow")
                 if knob.kind == "bool":
                     self.switch = ui.switch().props("dense size=sm")
-                    self.switch.mark(self.address)
                     self.switch.on(
                         "update:model-value",
                         lambda e: page.set(self.address, bool(e.args), True),
@@ -560,21 +563,21 @@ class _KnobRow:
                     self.choice = ui.select(list(knob.choices)).props(
                         "dense outlined options-dense"
                     )
-                    self.choice.classes("choice").mark(self.address)
+                    self.choice.classes("choice")
                     self.choice.on(
                         "update:model-value",
                         lambda: page.set(self.address, self.choice and self.choice.value, True),
                     )
                 else:
                     self.number = ui.input().props("dense outlined").classes("number")
-                    self.number.mark(f"number-{self.address}")
+                    self.number
                     self.number.on("keydown.enter", self._typed)
                     self.number.on("blur", self._typed)
             if knob.kind in ("int", "float") and knob.low is not None and knob.high is not None:
                 self.slider = ui.slider(
                     min=knob.low, max=knob.high, step=_slider_step(knob), value=knob.low
                 )
-                self.slider.props("dense").classes("knob-slider").mark(self.address)
+                self.slider.props("dense").classes("knob-slider")
                 self.slider.on("update:model-value", self._slid, throttle=_DRAG_SECONDS)
                 self.slider.on("change", self._released)
             ui.label(_facts(knob, page.bench.unchanged(stage, knob.name))).classes("facts")
@@ -695,10 +698,10 @@ def _chart_options(histogram: Histogram) -> dict[str, Any]:
         },
         "grid": {"left": 34, "right": 12, "top": 46, "bottom": 20},
         "xAxis": {
-            "type": "value",
-            "min": float(edges[0]),
-            "max": float(edges[-1]),
-            "axisLabel": {"fontSize": 10, "color": "#aab1bd"},
+            "type": "log" if histogram.log_axis else "value",
+            "min": float(f"{edges[0]:.2g}"),
+            "max": float(f"{edges[-1]:.3g}"),
+            "axisLabel": {"fontSize": 10, "color": "#aab1bd", "showMaxLabel": False},
             "splitLine": {"show": False},
         },
         "yAxis": {

@@ -51,12 +51,14 @@ class Guard:
         if scope["type"] == "http" and "token" in query:
             await self._enter(scope, query)(scope, receive, send)
             return
-        if scope["type"] == "http":
-            receive = _bounded(receive)
-        try:
+        if scope["type"] == "websocket":
             await self._app(scope, receive, send)
+            return
+        exchange = _Exchange(scope, receive, send)
+        try:
+            await self._app(scope, exchange.receive, exchange.send)
         except _TooLarge:
-            await self._refuse(scope, receive, send, 413, _TOO_LARGE)
+            return
 
     def _refusal(self, headers: dict[str, str], scope: Scope) -> tuple[int, str] | None:
         host, origin = headers.get("host", ""), headers.get("origin")
@@ -104,18 +106,47 @@ class _TooLarge(Exception):  # noqa: N818
     """More came than was announced, or than is taken."""
 
 
-def _bounded(receive: Receive) -> Receive:
-    taken = 0
+_POLICY = "; ".join(
+    (
+        "default-src 'self' data: blob:",
+        "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob:",
+        "style-src 'self' 'unsafe-inline'",
+        "frame-ancestors 'none'",
+    )
+)
+"""The page may talk to this server alone: neither the viewer nor a widget calls out."""
 
-    async def counted() -> Message:
-        nonlocal taken
-        message = await receive()
-        taken += len(message.get("body", b""))
-        if taken > MAX_BODY_BYTES:
+
+class _Exchange:
+    """One request and its answer: a bounded body, and an answer that keeps the page confined."""
+
+    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        self._scope, self._receive, self._send = scope, receive, send
+        self._taken = 0
+        self._refused = False
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self._taken += len(message.get("body", b""))
+        if self._taken > MAX_BODY_BYTES:
+            # Answered here: an application takes what is raised below it for its own failure.
+            answer = PlainTextResponse(f"refused: {_TOO_LARGE}\n", status_code=413)
+            await answer(self._scope, self._receive, self._send)
+            self._refused = True
             raise _TooLarge
         return message
 
-    return counted
+    async def send(self, message: Message) -> None:
+        if self._refused:
+            return
+        if message["type"] == "http.response.start":
+            message["headers"] = [
+                *message.get("headers", ()),
+                (b"content-security-policy", _POLICY.encode()),
+                (b"referrer-policy", b"no-referrer"),
+                (b"x-content-type-options", b"nosniff"),
+            ]
+        await self._send(message)
 
 
 class _Client:

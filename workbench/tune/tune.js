@@ -44,6 +44,8 @@ window.bench = (() => {
   const start = async (version, path = "/stream") => {
     stream = path;
     const canvas = document.getElementById("viewer");
+    // The viewer's graphics layer logs tens of thousands of lines, which take longer than it does.
+    console.debug = () => {};
     try {
       await wasm_bindgen({ module_or_path: `/viewer/${version}/re_viewer_bg.wasm` });
       handle = new wasm_bindgen.WebHandle({
@@ -51,6 +53,8 @@ window.bench = (() => {
         hide_welcome_screen: true,
         persist: false,
         theme: "dark",
+        memory_limit: "1GB",
+        check_for_updates_on_startup: false,
         panel_state_overrides: {
           top: "Hidden", blueprint: "Hidden", selection: "Hidden", time: "Hidden",
         },
@@ -97,7 +101,7 @@ window.bench = (() => {
             },
             label: {
               formatter: `${cut.name} ${cut.value.toPrecision(3)}`, color: "#e6e8ec", fontSize: 10,
-              position: "end", distance: [0, -4 - 12 * (k % 2)],
+              position: "end", distance: [0, 2 + 11 * (k % 2)],
             },
           })),
         },
@@ -118,14 +122,25 @@ window.bench = (() => {
     const tell = (settled) => element.$emit
       ? element.$emit("threshold", { line: state.held, value: state.cuts[state.held].value, settled })
       : null;
-    canvas.on("mousedown", (event) => { state.held = nearest(event.offsetX); });
+    // The axis may follow the data while a line is held: what counts is how far the hand has moved.
+    canvas.on("mousedown", (event) => {
+      state.held = nearest(event.offsetX);
+      if (state.held === null) return;
+      const value = (x) => chart.convertFromPixel({ xAxisIndex: 0 }, x);
+      state.from = { x: event.offsetX, value: state.cuts[state.held].value,
+        each: value(event.offsetX + 1) - value(event.offsetX),
+        times: value(event.offsetX + 1) / value(event.offsetX) };
+    });
     canvas.on("mousemove", (event) => {
       if (state.held === null) {
         canvas.setCursorStyle(nearest(event.offsetX) === null ? "default" : "ew-resize");
         return;
       }
       canvas.setCursorStyle("ew-resize");
-      state.cuts[state.held].value = chart.convertFromPixel({ xAxisIndex: 0 }, event.offsetX);
+      const moved = event.offsetX - state.from.x;
+      state.cuts[state.held].value = chart.getOption().xAxis[0].type === "log"
+        ? state.from.value * state.from.times ** moved
+        : state.from.value + moved * state.from.each;
       draw();
       const now = performance.now();
       if (now - state.told > 40) { state.told = now; tell(false); }
