@@ -285,3 +285,29 @@ def test_a_mistake_is_one_line(bench: Any, arguments: Any, code: int, says: str)
     ended = bench("teach", *arguments)
     assert ended.code == code
     assert says in ended.mistake
+
+
+# -- what is committed of it ----------------------------------------------------------------------
+
+DOCS = Path(__file__).parents[1] / "docs" / "lessons"
+
+
+def test_the_page_of_lessons_is_in_step_with_the_lessons() -> None:
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location("make_lessons", DOCS / "make.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    written = (DOCS / "README.md").read_text(encoding="utf-8")
+    assert written == module.readme(), "run python docs/lessons/make.py"
+
+
+@pytest.mark.parametrize("lesson", LESSONS, ids=IDS)
+def test_every_lesson_has_its_picture(lesson: Lesson) -> None:
+    import cv2
+
+    path = DOCS / f"{lesson.slug}.png"
+    assert path.stat().st_size < 150_000
+    image = cv2.imread(str(path))
+    assert image is not None and image.shape[1] >= 1000 and image.std() > 10

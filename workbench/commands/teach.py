@@ -50,7 +50,7 @@ def run(
         return
     seen: dict[int, list[Seen]] = {}
     if screenshot is not None:
-        _screenshot(chosen[0], assignments, screenshot, size)
+        picture_of(chosen[0], assignments, screenshot, size)
     if save is not None:
         seen = _save(chosen, assignments, save)
     elif as_json:
@@ -145,9 +145,10 @@ def _save(
     return seen
 
 
-def _screenshot(
+def picture_of(
     lesson: Lesson, assignments: Sequence[str], picture: Path, window: tuple[int, int]
 ) -> None:
+    """A picture of one lesson as the native viewer shows it, with no screen."""
     from workbench.teach.show import lesson_view, log_saved, saved_blueprint
     from workbench.viewer import Destinations, opened
 

@@ -208,7 +208,7 @@ class _LessonPage:
         self._step("chevron_left", "Previous lesson", numbers[place - 1] if place else None)
         titles = {n: f"{n}. {lesson.title}" for n, lesson in self.course.lessons.items()}
         choice = ui.select(titles, value=self.lesson.number).props("dense outlined options-dense")
-        choice.classes("lesson-choice").mark("lesson")
+        choice.classes("lesson-choice")
         choice.on("update:model-value", lambda: self._go(int(choice.value or 0)))
         later = numbers[place + 1] if place + 1 < len(numbers) else None
         self._step("chevron_right", "Next lesson", later)
@@ -221,7 +221,9 @@ class _LessonPage:
 
     def _step(self, icon: str, tip: str, target: int | None) -> None:
         button = ui.button(icon=icon, on_click=lambda: self._go(target or 0))
-        button.props("dense flat round").tooltip(tip).mark(tip.partition(" ")[0].lower())
+        button.props("dense flat round").tooltip(tip).classes(
+            f"step-{tip.partition(' ')[0].lower()}"
+        )
         button.set_enabled(target is not None)
 
     def _go(self, target: int) -> None:
@@ -340,14 +342,15 @@ class _ClaimCard:
         self.claim = claim
         self.opened = page.opened
         self.measured: dict[str, float] = {}
-        with ui.element("div").classes("claim").mark(f"claim-{place}"):
+        self.buttons: dict[str, ui.button] = {}
+        with ui.element("div").classes("claim"):
             ui.markdown(f"**{place}.** {claim.says}").classes("claim-says")
             with ui.element("div").classes("claim-row"):
                 for name, values in (("before", claim.before), ("after", claim.after)):
                     button = ui.button(name, on_click=lambda v=values: page.turn(v))
-                    button.props("dense outline no-caps size=sm").classes("textual")
-                    button.mark(f"{name}-{place}")
-                self.now = ui.label("").classes("claim-now").mark(f"now-{place}")
+                    button.props("dense outline no-caps size=sm").classes(f"textual turn-{name}")
+                    self.buttons[name] = button
+                self.now = ui.label("").classes("claim-now")
 
     def refresh(self, snapshot: Snapshot) -> None:
         run, settings = snapshot.run, snapshot.run_settings
@@ -356,7 +359,11 @@ class _ClaimCard:
             return
         value = self.claim.measure(run)
         for name, values in (("before", self.claim.before), ("after", self.claim.after)):
-            if self._stands(settings, values):
+            stands = self._stands(settings, values)
+            self.buttons[name].classes(
+                add="stands" if stands else "", remove="" if stands else "stands"
+            )
+            if stands:
                 self.measured[name] = value
         unit = f" {self.claim.unit}" if self.claim.unit else ""
         says = f"{self.claim.quantity}: {number(value)}{unit}"

@@ -67,7 +67,8 @@ def log_saved(
         recording.log(f"{path}/now", _markdown(_now_page(here, says)))
         turn += 1
 
-    log_turn({}, ["as the lesson opens"])
+    turned = ", ".join(opened.settings.changed)
+    log_turn({}, [f"turned: {turned}" if turned else "as the lesson opens"])
     if not sweeps:
         return
     for place, claim in enumerate(lesson.claims, 1):
