@@ -100,6 +100,32 @@ def test_the_pictures_are_logged_at_both_ends_of_every_claim(
     lesson_view(opened[lesson.number], opened[lesson.number].run())
 
 
+@pytest.mark.parametrize("lesson", LESSONS, ids=IDS)
+def test_a_knob_turned_to_its_end_is_shown_or_told(
+    lesson: Lesson, opened: dict[int, OpenLesson]
+) -> None:
+    """A student turns everything as far as it goes: a stage may refuse, pictures may not break."""
+    import rerun as rr
+
+    from workbench.teach.show import log_pictures
+
+    here = opened[lesson.number]
+    recording = rr.RecordingStream("lessons")
+    recording.memory_recording()
+    for address, declared in here.knobs.items():
+        ends = declared.choices or (declared.low, declared.high)
+        for end in (True, False) if declared.kind == "bool" else ends:
+            value = int(end) if declared.kind == "int" else end
+            pipeline = here.turned({address: value})
+            run = pipeline.run(here.frame)
+            if run.failures:
+                assert run.failures[0].says
+                continue
+            log_pictures(recording, OpenLesson(lesson, pipeline, here.frame), run)
+            for claim in lesson.claims:
+                claim.measure(run)
+
+
 def test_the_same_lesson_gives_the_same_numbers(opened: dict[int, OpenLesson]) -> None:
     lesson = lesson_numbered(LESSONS, 9)
     first = [opened[9].check(claim) for claim in lesson.claims]

@@ -152,7 +152,9 @@ def _worst(run: Run) -> float:
 
 
 def _depth(run: Run) -> float:
-    return 1e3 * float(np.nanmedian(run.artifacts["depth_m"]))
+    depth = run.artifacts["depth_m"]
+    known = np.isfinite(depth)
+    return 1e3 * float(np.median(depth[known])) if known.any() else float("nan")
 
 
 LESSON = Lesson(

@@ -53,7 +53,9 @@ def _picks(run: Run) -> float:
 
 
 def _occluded(run: Run) -> float:
-    return float(run.artifacts["candidates"]["occluded"].sum())
+    candidates = run.artifacts["candidates"]
+    # Without any depth there is no verdict, and a candidate has no such field.
+    return float(candidates["occluded"].sum()) if len(candidates) else 0.0
 
 
 def _known(run: Run) -> float:
@@ -108,14 +110,19 @@ class PickPictures(Stage):
         )  # fmt: skip
         recording.log(f"{self.name}/lines", edge_image(artifacts["region_lines"]))
         recording.log(f"{self.name}/candidates", grey)
-        strips, colours = region_outlines(artifacts["labels"], artifacts["candidates"])
+        candidates = artifacts["candidates"]
+        strips: list[Any] = []
+        colours: list[Any] = []
+        if len(candidates):
+            strips, colours = region_outlines(artifacts["labels"], candidates)
         recording.log(
             f"{self.name}/candidates/outlines",
             rr.LineStrips2D(strips, colors=colours, radii=0.7),
         )
-        places, texts, colours = candidate_marks(
-            artifacts["candidates"], artifacts["regions"], database
-        )
+        places: list[Any] = []
+        texts: list[str] = []
+        if len(candidates):
+            places, texts, colours = candidate_marks(candidates, artifacts["regions"], database)
         recording.log(
             f"{self.name}/candidates/marks",
             rr.Points2D(places, labels=texts, colors=colours, radii=1.5, show_labels=True),

@@ -133,15 +133,19 @@ def _save(
     views = []
     with opened(Destinations(save=path), _identity(lessons)) as stream:
         total = sum(len(lesson.claims) for lesson in lessons)
-        with progress("save", total) as advance:
-            for lesson in lessons:
-                opened_lesson = OpenLesson.open(lesson, assignments, store)
-                views.append(lesson_view(opened_lesson, opened_lesson.run()))
-                for one in log_saved(stream.recording, opened_lesson):
-                    seen.setdefault(lesson.number, []).append(one)
-                    interrupts.check()
-                    advance()
-        stream.recording.send_blueprint(saved_blueprint(views))
+        try:
+            with progress("save", total) as advance:
+                for lesson in lessons:
+                    opened_lesson = OpenLesson.open(lesson, assignments, store)
+                    views.append(lesson_view(opened_lesson, opened_lesson.run()))
+                    for one in log_saved(stream.recording, opened_lesson):
+                        seen.setdefault(lesson.number, []).append(one)
+                        interrupts.check()
+                        advance()
+        finally:
+            # What came before a Ctrl-C can be looked at as well.
+            if views:
+                stream.recording.send_blueprint(saved_blueprint(views))
     return seen
 
 
