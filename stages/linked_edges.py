@@ -49,6 +49,7 @@ class LinkedEdges(Stage):
 
     name = "linked_edges"
     chapter = "segmentation"
+    published_time = "about 500, Pentium 133"
     needs = (EDGE_CHOICE, DEPTH.optional(), RELATIVE.optional(), NEAR_CAMERA)
     gives = (
         EDGES_RECONSTRUCTED,

@@ -42,9 +42,11 @@ class Recognition(Stage):
     ``candidates`` is a numpy structured array, the largest first: ``label``, ``rank`` (by area),
     ``elevation_m``, ``tilt_deg``, ``area_mm2``, ``perimeter_mm``, ``shape_factor``,
     ``greatest_distance_mm``, ``occluded``, ``occluded_by``, ``occluded_share``, ``distances`` (to
-    each model), ``model``, ``distance``, ``shape_distance``, ``zeta``, ``mirrored``, ``reason``
-    (0 none, 1 too small, 2 leaves the image, 3 tilted, 4 not flat, 5 occluded, 6 over φ, 7 over
-    ζ, 8 surroundings), ``picked``.  ``verdict`` has ``verdict``, ``region``, ``object`` and
+    each model), ``model``, ``distance``, ``shape_distance``, ``zeta``, ``mirrored``,
+    ``visible_model`` and ``hidden_share`` (a region that is covered or leaves the image is named
+    by what shows of it, but not picked), ``reason`` (0 none, 1 too small, 2 leaves the image,
+    3 tilted, 4 not flat, 5 occluded, 6 over φ, 7 over ζ, 8 surroundings), ``picked``.
+    ``verdict`` has ``verdict``, ``region``, ``object`` and
     ``reason``; it is None without models or depth.
     """
 
@@ -118,6 +120,16 @@ class Recognition(Stage):
             high=10,
             step=0.1,
             unit="factor",
+        )
+
+        most_hidden: float = knob(
+            0.2,
+            "Up to this share of its surface hidden, a region is named by what shows of it "
+            "(section 7 promises 0.2); 0 turns this off.",
+            low=0,
+            high=0.5,
+            step=0.05,
+            unit="share",
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
@@ -237,4 +249,5 @@ def rules_of(parameters: Any) -> Any:
         parameters.max_residual,
         parameters.phi_scale,
         parameters.zeta_scale,
+        parameters.most_hidden,
     )

@@ -52,7 +52,7 @@ def test_help_names_every_flag_and_says_something_of_each(bench: Command, comman
 
 def test_commands_that_run_stages_share_their_flags() -> None:
     shared = {"calibration", "models", "preset", "config", "set", "topic", "frames", "until"}
-    for name in ("replay", "export", "evaluate"):
+    for name in ("replay", "export", "evaluate", "compare"):
         flags = {flag.lstrip("-") for one in COMMANDS[name].params for flag in one.opts}
         assert flags >= shared | {"plugin", "json"}, name
 
@@ -129,7 +129,12 @@ def test_evaluate_gives_figures_with_their_coverage(bench: Command, scene: Path)
     assert all(score["name"] and score["unit"] for score in scores)
     rms = next(score for score in scores if "rms" in score["name"])
     assert 0 < rms["value"] < 0.5 and 0.9 < rms["coverage"] <= 1
-    assert "rms" in bench("evaluate", scene, "--frames", ":2").out
+    told = bench("evaluate", scene, "--frames", ":2").out
+    assert "rms" in told
+    # What the paper reports stands beside it, with the times of its stages.
+    published = told[told.index("Beside the published figures") :]
+    for figure in ("% of stand-off", "% of span", "rotation, flat", "covered", "Pentium 133"):
+        assert figure in published, figure
 
 
 def test_calibrate_writes_a_file_that_replay_takes(

@@ -180,6 +180,49 @@ def test_a_covered_part_is_marked_and_the_upper_one_picked(database: Database) -
     assert row["reason"] == Reason.OCCLUDED
 
 
+@pytest.mark.parametrize("turn", [0.0, 37.0, 200.0])
+@pytest.mark.parametrize(
+    ("polygon", "share", "named"),
+    [
+        (RECTANGLE, 0.15, "plate"),
+        (RECTANGLE * 0.8, 0.10, "small plate"),
+        (ELL * [-1, 1], 0.15, "ell"),
+        (RECTANGLE, 0.4, None),
+        (np.array([[-25, -15], [25, -15], [12, 15], [-12, 15]]) * 1e-3, 0.1, None),
+    ],
+    ids=["plate", "small plate", "ell, turned over", "half a plate", "not trained"],
+)
+def test_what_shows_of_a_covered_part_names_it_or_nothing_does(
+    database: Database, polygon: np.ndarray, share: float, named: str | None, turn: float
+) -> None:
+    """A strip that lies higher hides the lower end of a part, which is named and not picked."""
+    scene = Scene()
+    low = scene.add(polygon, turn, (0.0, 0.0, 0.785))
+    rows = np.nonzero(scene.labels == low)[0]
+    # The strip's upper border runs where the share that is asked for lies below it.
+    down = int(np.sort(rows)[-int(share * len(rows))])
+    up_m = (CAMERA.cy - down) / CAMERA.fy * 0.770
+    strip = np.array([[-60, -40], [60, -40], [60, 0], [-60, 0]]) * 1e-3
+    scene.add(strip, 0.0, (0.0, -up_m, 0.770))
+    candidates, verdict = scene.judge(database)
+    row = candidates[candidates["label"] == low][0]
+    assert row["reason"] == Reason.OCCLUDED and not row["picked"]
+    assert verdict["verdict"] == "rearrange"
+    assert (row["visible_model"] >= 0) == (named is not None)
+    if named is not None:
+        assert database.names[row["visible_model"]] == named
+        assert 0.02 < row["hidden_share"] <= 0.2
+        assert f"what shows is {named}'s" in verdict["reason"]
+
+
+def test_without_hidden_shares_nothing_is_named_by_what_shows(database: Database) -> None:
+    scene = Scene()
+    scene.add(RECTANGLE, 0.0, (0.055, 0.0, 0.785))
+    cut = [scene.judge(database, Rules(most_hidden=most))[0][0] for most in (0.0, 0.2)]
+    assert [row["reason"] for row in cut] == [Reason.CUT, Reason.CUT]
+    assert [row["visible_model"] for row in cut] == [-1, 0]
+
+
 def test_no_region_of_a_parts_size(database: Database) -> None:
     scene = Scene()
     scene.add(RECTANGLE * 0.4, 0.0)

@@ -72,26 +72,37 @@ def __getattr__(name: str) -> object:
 def open(
     recording: str | Path,
     *,
-    preset: str | None = None,
-    set: Sequence[str] = (),
-    until: str | None = None,
-    topics: Mapping[str, str] | None = None,
     calibration: str | Path | None = None,
+    models: str | Path | None = None,
+    preset: str | None = None,
+    config: str | Path | None = None,
+    set: Sequence[str] = (),
+    topics: Mapping[str, str] | None = None,
+    frames: tuple[int, int | None] = (0, None),
+    until: str | None = None,
     plugins: Sequence[str | Path] = (),
 ) -> Session:
     """A recording with its pipeline, as the command line would put it together.
 
-    ``set`` holds ``stage.parameter=value`` texts.  Iterate ``runs()`` of what is returned.
+    ``set`` holds ``stage.parameter=value`` texts; ``frames`` is (first, one past the last, or
+    None for the end).  Iterate ``runs()`` of what is returned.  Raises ``RecordingError``,
+    ``StageError`` or ``SettingsError``, each with one line.
     """
     from workbench.session import Options, Session
 
     return Session.open(
         Options(
             Path(recording),
-            resources={} if calibration is None else {"calibration": Path(calibration)},
+            resources={
+                name: Path(path)
+                for name, path in (("calibration", calibration), ("models", models))
+                if path is not None
+            },
             preset=preset,
+            config=None if config is None else Path(config),
             assignments=set,
             topics=topics or {},
+            frames=frames,
             until=until,
             plugins=[Path(plugin) for plugin in plugins],
         )

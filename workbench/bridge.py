@@ -18,7 +18,7 @@ from workbench.errors import one_line
 from workbench.pipeline import Pipeline, Run, dependencies
 from workbench.report import RunReport
 from workbench.session import Session
-from workbench.stage import Logged, RecordedCamera, RecordedImage, Resource
+from workbench.stage import Logged, RecordedCamera, RecordedImage, Resource, Stage
 
 FRAME_TIMELINE = "frame"
 STAMP_TIMELINE = "stamp"
@@ -145,6 +145,7 @@ class Bridge:
                 code=[f"{k}={v}" for k, v in provenance["code"].items()],
                 resources=[f"{k}={v['digest']}" for k, v in provenance["resources"].items()]
                 or ["none"],
+                libraries=[f"{k}={v}" for k, v in provenance["libraries"].items()],
             ),
         )
 
@@ -210,10 +211,38 @@ class Bridge:
     def blueprint(
         self, run: Run, scored: bool, broken: Mapping[str, str], report: RunReport
     ) -> rrb.Blueprint:
-        """A row for each chapter of the pipeline, read from left to right, and a shelf below.
+        """All at a glance first, then a tab for each chapter of the pipeline and one for the bench.
 
+        At a glance there is a row for each chapter, read from left to right, and a shelf below.
         Stages in ``broken`` have nothing to show; their errors are among the defects.
         """
+        shown = [stage for stage in self.session.pipeline.stages if stage.name not in broken]
+        for stage in list(shown):
+            try:
+                stage.views(self._logged(run, stage.name))
+            except Exception as error:
+                report.fail(stage.name, f"its views: {one_line(error)}")
+                shown.remove(stage)
+        rows = self._rows(run, shown)
+        chapters = [_row(row, name) for name, row in rows.items()]
+        glance = rrb.Vertical(
+            *chapters,
+            _row(_shelf(scored, legends=False), shares=[1.0] * (3 + scored) + [1.8]),
+            row_shares=[_CHAPTER_SHARE] * len(chapters) + [1],
+            name="at a glance",
+        )
+        # A view belongs to one container: the tabs hold views of their own.
+        tabs = [_row(row, name) for name, row in self._rows(run, shown).items()]
+        bench = rrb.Grid(*_shelf(scored, legends=True), name="bench")
+        return rrb.Blueprint(
+            rrb.Tabs(glance, *tabs, bench),
+            rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
+            rrb.SelectionPanel(state="collapsed"),
+            rrb.BlueprintPanel(state="collapsed"),
+        )
+
+    def _rows(self, run: Run, shown: Iterable[Stage]) -> dict[str, list[Any]]:
+        """The views of each chapter, the recorded images before those of the first."""
         recorded = rrb.Vertical(
             *(
                 rrb.Spatial2DView(origin=f"recorded/{channel}", name=f"recorded {channel}")
@@ -224,44 +253,29 @@ class Bridge:
         rows: dict[str, list[Any]] = {}
         for stage in self.session.pipeline.stages:
             row = rows.setdefault(stage.chapter, [] if rows else [recorded])
-            if stage.name in broken:
-                continue
-            try:
+            if stage in shown:
                 row += stage.views(self._logged(run, stage.name))
-            except Exception as error:
-                report.fail(stage.name, f"its views: {one_line(error)}")
-        shelf: list[Any] = []
-        if scored:
-            shelf.append(
-                rrb.TimeSeriesView(
-                    origin="bench/scores",
-                    name="against ground truth",
-                    plot_legend=rrb.Corner2D.LeftTop,
-                )
-            )
-        shelf += [
-            rrb.TimeSeriesView(
-                origin="bench/times", name="stage times, ms", plot_legend=rrb.Corner2D.LeftTop
-            ),
-            rrb.TextDocumentView(origin="bench/defects", name="defects"),
-            rrb.TextDocumentView(origin="bench/parameters", name="parameters and provenance"),
-            rrb.GraphView(origin="bench/pipeline", name="pipeline"),
-        ]
-        chapters = [
-            rrb.Horizontal(*row, column_shares=[_share(view) for view in row], name=chapter)
-            for chapter, row in rows.items()
-            if row
-        ]
-        return rrb.Blueprint(
-            rrb.Vertical(
-                *chapters,
-                rrb.Horizontal(*shelf, column_shares=[1.0] * (len(shelf) - 1) + [1.8]),
-                row_shares=[_CHAPTER_SHARE] * len(chapters) + [1],
-            ),
-            rrb.TimePanel(state="collapsed", timeline=FRAME_TIMELINE),
-            rrb.SelectionPanel(state="collapsed"),
-            rrb.BlueprintPanel(state="collapsed"),
-        )
+        return {chapter: row for chapter, row in rows.items() if row}
+
+
+def _shelf(scored: bool, legends: bool) -> list[Any]:
+    """The bench's own views; in little room a legend would hide the curves."""
+    legend = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legends)
+    plots = [("bench/times", "stage times, ms")]
+    if scored:
+        plots.insert(0, ("bench/scores", "against ground truth"))
+    return [
+        *(rrb.TimeSeriesView(origin=path, name=name, plot_legend=legend) for path, name in plots),
+        rrb.TextDocumentView(origin="bench/defects", name="defects"),
+        rrb.TextDocumentView(origin="bench/parameters", name="parameters and provenance"),
+        rrb.GraphView(origin="bench/pipeline", name="pipeline"),
+    ]
+
+
+def _row(views: list[Any], name: str | None = None, shares: list[float] | None = None) -> Any:
+    return rrb.Horizontal(
+        *views, column_shares=shares or [_share(view) for view in views], name=name
+    )
 
 
 def _share(view: Any) -> float:

@@ -258,6 +258,64 @@ def evaluate(
 
 
 @app.command()
+def compare(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A recording, to run under both configurations; or two saved replays (.rrd).",
+            metavar="REC | A.rrd B.rrd",
+        ),
+    ],
+    a: Annotated[
+        str | None,
+        typer.Option(
+            help="What is held against: a preset, a TOML file or stage.parameter=value[,…]; if "
+            "not given, what --preset, --config and --set say.",
+            metavar="CONFIG",
+        ),
+    ] = None,
+    b: Annotated[
+        str | None,
+        typer.Option(help="What is held against A, in the same ways.", metavar="CONFIG"),
+    ] = None,
+    save: Annotated[Path | None, typer.Option(help="Keep what is shown in this .rrd file.")] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of the viewer; needs no screen.")
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="Show it in a browser.")] = False,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1920x1080",
+    show: Annotated[
+        str | None,
+        typer.Option(help="Open on this stage's tab instead of the summary.", metavar="STAGE"),
+    ] = None,
+    calibration: Calibration = None,
+    models: Models = None,
+    preset: Preset = None,
+    config: Config = None,
+    assignments: Set = None,
+    topic: Topic = None,
+    frames: Frames = None,
+    until: Until = None,
+    plugin: Plugin = None,
+    as_json: Json = False,
+) -> None:
+    """Hold two configurations, or two saved replays, against each other.
+
+    Tells which parameters, digests, results, scores and times differ, and shows A, B and their
+    difference side by side. Exits with 0 whether or not there is a difference; 1 means that the
+    data or a run failed.
+    """
+    from workbench.commands import compare as command
+
+    options = _options(
+        files[0], calibration, models, preset, config, assignments, topic, frames, until, plugin
+    )
+    command.run(files, options, a, b, save, screenshot, web, window, show, as_json)
+
+
+@app.command()
 def calibrate(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],
@@ -290,6 +348,12 @@ def train(
         str | None,
         typer.Option(help="Degrees of the frames, separated by commas; else the ground truth's."),
     ] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Keep pictures of what training found in this .rrd file.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of them; needs no screen.")
+    ] = None,
     assignments: Set = None,
     topic: Topic = None,
     plugin: Plugin = None,
@@ -307,6 +371,8 @@ def train(
         assignments or [],
         parse_topics(topic or []),
         plugin or [],
+        save,
+        screenshot,
         as_json,
     )
 

@@ -79,40 +79,61 @@ def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> 
     out.print(grid)
 
 
-def score_rows(stage: str, scores: Iterable[Score]) -> Iterator[tuple[str, ...]]:
-    """Scores as table rows: stage, figure, value, unit, covered, note."""
-    for score in scores:
-        covered = "" if score.coverage is None else f"{100 * score.coverage:.1f} %"
-        value = f"{score.value:.3f}" if math.isfinite(score.value) else "none"
-        yield (stage, score.name, value, score.unit, covered, score.note)
-
-
-SCORE_COLUMNS = ("stage", "figure", "value", "unit", "covered", "note")
-
-
 def scores_beside(scores: Mapping[str, Mapping[str, Sequence[Score]]]) -> None:
     """Scores of several presets side by side: one column a preset, with what it covers."""
+    rows = _by_figure(scores)
+    if rows:
+        table(
+            "Against ground truth",
+            ("stage", "figure", *_value_columns(scores), "unit", "note"),
+            (
+                (stage, figure, *_values(found, scores), unit, _shared_note(found))
+                for (stage, figure, unit), found in rows.items()
+            ),
+        )
+
+
+def published_beside(reports: Mapping[str, RunReport]) -> None:
+    """What the publication reports, beside what the same stages reached here, by preset."""
+    scores = {preset: report.scores() for preset, report in reports.items()}
+    rows = [
+        (stage, figure, *_values(found, scores), unit, published, _shared_note(found))
+        for (stage, figure, unit), found in _by_figure(scores).items()
+        if (published := next(iter(found.values())).published)
+    ]
+    for stage in next(iter(reports.values())).session.pipeline.stages:
+        if stage.published_time and any(stage.name in r.times_ms for r in reports.values()):
+            times = (
+                f"{report.median_ms(stage.name):.2f}" if stage.name in report.times_ms else "none"
+                for report in reports.values()
+            )
+            rows.append((stage.name, "time of a frame", *times, "ms", stage.published_time, ""))
+    if rows:
+        table(
+            "Beside the published figures",
+            ("stage", "figure", *_value_columns(scores), "unit", "published", "note"),
+            rows,
+        )
+
+
+def _by_figure(
+    scores: Mapping[str, Mapping[str, Sequence[Score]]],
+) -> dict[tuple[str, str, str], dict[str, Score]]:
+    """(stage, figure, unit) to each preset's score."""
     rows: dict[tuple[str, str, str], dict[str, Score]] = {}
     for preset, stages in scores.items():
         for stage, own in stages.items():
             for score in own:
                 rows.setdefault((stage, score.name, score.unit), {})[preset] = score
-    if not rows:
-        return
-    table(
-        "Against ground truth",
-        ("stage", "figure", *(f"{preset or 'this'} value" for preset in scores), "unit", "note"),
-        (
-            (
-                stage,
-                figure,
-                *(_with_coverage(found.get(preset)) for preset in scores),
-                unit,
-                _shared_note(found),
-            )
-            for (stage, figure, unit), found in rows.items()
-        ),
-    )
+    return rows
+
+
+def _value_columns(presets: Iterable[str]) -> Iterator[str]:
+    return (f"{preset or 'this'} value" for preset in presets)
+
+
+def _values(found: Mapping[str, Score], presets: Iterable[str]) -> Iterator[str]:
+    return (_with_coverage(found.get(preset)) for preset in presets)
 
 
 def _shared_note(found: Mapping[str, Score]) -> str:
@@ -145,10 +166,13 @@ def closing_tables(report: RunReport, scores: bool = True) -> None:
                 for name in report.times_ms
             ),
         )
-    found = report.scores() if scores else {}
-    if found:
-        rows = [row for stage, own in found.items() for row in score_rows(stage, own)]
-        table("Against ground truth", SCORE_COLUMNS, rows)
+    if scores:
+        scores_beside({report.session.pipeline.settings.preset: report.scores()})
+    troubles(report)
+
+
+def troubles(report: RunReport) -> None:
+    """What was warned of and what failed, a line each."""
     for says, count in report.warnings.items():
         out.print(f"warning, {count} frames: {says}", style="yellow", markup=False)
     for (stage, says), count in report.failures.items():

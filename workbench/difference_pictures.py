@@ -35,11 +35,11 @@ _SPAN_PERCENTILE = 95.0
 _BAR_COLOURS = ((60, 220, 235), (45, 110, 200), (48, 48, 52), (150, 120, 50), (250, 225, 60))
 
 LEGEND = (
-    "cyan: only in A, or greater in A; yellow: only in B, or greater in B; grey: in both; "
-    "magenta: in both, but another value or a region cut in another way; "
-    "violet and green in maps: known only in A, known only in B"
+    "**cyan** only in A, or greater in A; **yellow** only in B, or greater in B; **grey** in both; "
+    "**magenta** in both, but another value or a region cut in another way; in maps "
+    "**violet** known only in A, **green** known only in B"
 )
-"""The colours in words, for a page beside the pictures."""
+"""The colours in words, as markdown for a page beside the pictures."""
 
 
 def has_picture(difference: Difference) -> bool:

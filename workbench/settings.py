@@ -132,6 +132,11 @@ def to_toml(
     return tomli_w.dumps(document)
 
 
+def reason_in(config: Path) -> str:
+    """Why a configuration was kept, as its file says.  Raises :class:`SettingsError`."""
+    return str(_read_toml(config).get("reason", ""))
+
+
 def _without_none(value: Any) -> Any:
     """``value`` as TOML can hold it, which has no null."""
     if isinstance(value, Mapping):

@@ -130,7 +130,9 @@ class Resource(Artifact):
     ``load`` reads it (and raises ``ValueError`` with one line if it cannot); ``make`` names the
     procedure that writes it, as ``module:object``, which ``workbench calibrate`` or
     ``workbench train`` runs: the object has ``Parameters`` and ``run``, and what ``run`` returns
-    has ``report`` and ``save(path)``.  ``filename`` is what is looked for beside a recording.
+    has ``report`` and ``save(path)``, and for ``train`` ``log(recording)``, which logs it to a
+    ``rerun.RecordingStream`` and returns a blueprint.  ``filename`` is what is looked for beside
+    a recording.
     """
 
     load: Callable[[Path], Any] | None = field(default=None, compare=False)
@@ -235,13 +237,18 @@ class Finding:
 
 @dataclass(frozen=True)
 class Score:
-    """One figure of :meth:`Scorer.summary`: its value, unit, and how much it covers (0..1)."""
+    """One figure of :meth:`Scorer.summary`: its value, unit, and how much it covers (0..1).
+
+    ``published`` is what the publication that the stage implements reports for it, in its own
+    words; ``evaluate`` sets the two side by side.
+    """
 
     name: str
     value: float
     unit: str = ""
     coverage: float | None = None
     note: str = ""
+    published: str = ""
 
 
 @dataclass(frozen=True)
@@ -316,6 +323,8 @@ class Stage:
     """Stages of one chapter share a row of the viewer's layout."""
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     """Preset name to the parameters in which it differs from the defaults."""
+    published_time: ClassVar[str] = ""
+    """What the publication that the stage implements says of its time; empty if nothing."""
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         """Outputs from inputs and parameters.  An exception is caught, shown and counted."""

@@ -47,6 +47,10 @@ free, are the best that will ever be seen of it."""
 _BORDER_PX = 0.25
 """A region's border is known no better than this."""
 
+_TILT_DEG = 25.0
+_NORMAL_ERROR_DEG = 2.0
+"""Up to this tilt (section 7) a face must be recognised by a normal that is so far off."""
+
 _BODY_ABOVE_TABLE_MM = 3.0
 """What lies higher than this beside a part that lies alone is the part itself."""
 
@@ -178,6 +182,13 @@ class Database:
             }
         with replacing(path) as beside, beside.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    def log(self, recording: Any) -> Any:
+        """Log what training found to a ``rerun.RecordingStream``; returns the layout for it."""
+        from stages.matching.report import blueprint, log_database
+
+        log_database(recording, self)
+        return blueprint(self)
 
     @staticmethod
     def load(path: Path) -> Database:
@@ -345,6 +356,24 @@ def _border_error(parts: Sequence[Part], deviation: NDArray[np.float64], shift_m
     return worst
 
 
+def _tilt_error(parts: Sequence[Part], deviation: NDArray[np.float64]) -> float:
+    """Greatest distance that an error of the normal puts between equal faces, at 25° of tilt.
+
+    A face that is rectified by a normal that is off by δ is stretched by tan(tilt) δ, worst of all
+    along its greatest extent.
+    """
+    stretch = 1 + np.tan(np.radians(_TILT_DEG)) * np.radians(_NORMAL_ERROR_DEG)
+    worst = 0.0
+    for part in parts:
+        area, perimeter, shape, reach = np.median(part.features, axis=0)
+        # A long face is all but twice its length around; a round one turns half of it away.
+        longer = 1 + (stretch - 1) * min(4 * reach / perimeter, 1.0)
+        before = np.array([area, perimeter, shape, reach])
+        after = before * np.array([stretch, longer, stretch / longer**2, stretch])
+        worst = max(worst, float(np.linalg.norm((after - before) / deviation)))
+    return worst
+
+
 def _threshold(
     parts: Sequence[Part],
     mean: NDArray[np.float64],
@@ -356,7 +385,8 @@ def _threshold(
     After Nene and Nayar: the distances inside the database say how far a neighbour can be.  φ is
     several times the farthest that a view lies from its own part's others, or what a border that is
     a fraction of a pixel off does (a symmetric part's views come in equal pairs, whose distance is
-    none), and never more than half of what separates two parts: then nothing is within φ of both.
+    none), and what an error of the normal adds on a tilted face (the views lie flat); and never
+    more than half of what separates two parts: then nothing is within φ of both.
     """
     sets = [(part.features - mean) / deviation for part in parts]
 
@@ -374,7 +404,12 @@ def _threshold(
             if parts[i].name != parts[j].name:
                 between = min(between, float(apart(sets[i], sets[j]).min()))
     border = _border_error(parts, deviation, _BORDER_PX * pixel_mm)
-    return min(max(_PHI_OVER_VIEWS * within, border), 0.5 * between), within, between
+    alone = max(_PHI_OVER_VIEWS * within, border)
+    return (
+        min(float(np.hypot(alone, _tilt_error(parts, deviation))), 0.5 * between),
+        within,
+        between,
+    )
 
 
 def _separate(parts: Sequence[Part]) -> list[float]:

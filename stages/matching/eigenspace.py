@@ -4,20 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft2
 from scipy.interpolate import CubicSpline
 
 from stages.matching.surfaces import Surface, soft_view
 
-__all__ = ["POINTS", "Eigenspace", "Match", "build", "match", "matches", "turned_views"]
+__all__ = [
+    "OUTLINE_STEP_DEG", "POINTS", "Eigenspace", "Match", "Outlines", "build", "match", "matches",
+    "turned_views",
+]  # fmt: skip
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 POINTS = 720
 """Points to which the manifold is resampled: one every half degree."""
+
+OUTLINE_STEP_DEG = 10.0
+
+_MIRRORED_APART = 0.1
+"""A mirror image that differs by more of its area is no turned view of the surface."""
 
 _SYMMETRIES = range(12, 1, -1)
 
@@ -53,6 +64,49 @@ class Eigenspace:
     def side(self) -> int:
         """Pixels of an image's side."""
         return int(round(np.sqrt(self.mean.size)))
+
+    def outline(self, turn_deg: float, enlarged: int = 1) -> F32:
+        """The surface [N N], 0 or 1, as the nearest point of the manifold shows it."""
+        at = round(turn_deg * POINTS / 360) % POINTS
+        image = (self.mean + self.manifold[at] @ self.basis).reshape(self.side, self.side)
+        if enlarged > 1:
+            image = cv2.resize(image, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC)
+        return (image > 0.5).astype(np.float32)
+
+    @cached_property
+    def outlines(self) -> Outlines:
+        """The surface's outlines at every tenth degree."""
+        turns = np.arange(0, 360 / self.order, OUTLINE_STEP_DEG)
+        masks = np.stack([self.outline(float(turn)) for turn in turns])
+        flipped = np.ascontiguousarray(masks[..., ::-1])
+        # Where the mirror image is one of the turned ones it is not another surface.
+        apart = np.abs(flipped[0] - masks).sum(axis=(1, 2)).min() / masks[0].sum()
+        mirrored = np.zeros(len(turns), bool)
+        if apart > _MIRRORED_APART:
+            masks, turns = np.concatenate([masks, flipped]), np.tile(turns, 2)
+            mirrored = np.repeat([False, True], len(mirrored))
+        size = next_fast_len(2 * self.side, real=True)
+        return Outlines(
+            turns, mirrored, masks.sum(axis=(1, 2)), np.conj(rfft2(masks, (size, size))), size
+        )
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """A surface's outlines, turned and mirrored, ready to be laid anywhere over an image.
+
+    Attributes:
+        turn_deg: [K] and mirrored: [K] bool, of each; mirrored before the turn is undone.
+        area_px: [K] of each.
+        spectra: [K size size/2+1] complex, conjugated.
+        size: of the transforms, twice an image's side or more.
+    """
+
+    turn_deg: F64
+    mirrored: NDArray[np.bool_]
+    area_px: F32
+    spectra: NDArray[np.complex64]
+    size: int
 
 
 @dataclass(frozen=True)

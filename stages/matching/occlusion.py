@@ -13,6 +13,10 @@ _REACH = 3
 """Regions that stand no farther apart than this many pixels share a border: a line's width."""
 
 
+_UPPER_PERCENT = 90.0
+"""Of a region's heights: what is over it may be an outlier, or the sensor's window over an edge."""
+
+
 class Cover(dict[tuple[int, int], tuple[int, float]]):
     """(below, above) → pixels of border along which it is so, and by how much (median, metres)."""
 
@@ -24,14 +28,19 @@ def covers(
     residual_m: np.ndarray,
     camera: Camera,
     least_m: float,
+    depth_m: np.ndarray,
 ) -> Cover:
     """Who lies above whom: both planes are carried on to the border and compared there.
+
+    A steep flank of which little is measured can have a plane that is far from it.  So some of
+    what was measured of the upper region must lie above the lower one's plane as well.
 
     Args:
         labels: [H W] int32, 0 = none.
         point_m, normal: [R 3], residual_m: [R], the regions' planes; NaN where there is none.
         camera: intrinsics.
         least_m: a smaller step is none; nor is one of less than 3 standard deviations of the fits.
+        depth_m: [H W] float32, NaN where unknown.
 
     Returns:
         for each pair in which one lies above the other: how many border pixels say so.
@@ -77,7 +86,31 @@ def covers(
         low, high = (first[i], second[i]) if step[i] > 0 else (second[i], first[i])
         below.setdefault((int(low) + 1, int(high) + 1), []).append(abs(float(step[i])))
     assert count == len(residual_m)
-    return Cover({pair: (len(s), float(np.median(s))) for pair, s in below.items()})
+    return Cover(
+        {
+            (low, high): (len(steps), float(np.median(steps)))
+            for (low, high), steps in below.items()
+            if _rises_above(labels == high, depth_m, camera, normal[low - 1], offset[low - 1])
+            > least_m
+        }
+    )
+
+
+def _rises_above(
+    region: NDArray[np.bool_],
+    depth_m: np.ndarray,
+    camera: Camera,
+    normal: np.ndarray,
+    offset_m: float,
+) -> float:
+    """How far the upper tenth of a region lies above a plane, metres; -inf if nothing is known."""
+    rows, columns = np.nonzero(region & np.isfinite(depth_m))
+    if not len(rows):
+        return -np.inf
+    z = depth_m[rows, columns].astype(np.float64)
+    rx, ry = camera.rays(columns.astype(np.float64), rows.astype(np.float64))
+    height = z * (normal[0] * rx + normal[1] * ry + normal[2]) - offset_m
+    return float(np.percentile(height, _UPPER_PERCENT))
 
 
 def _has_plane(labels: np.ndarray, residual_m: np.ndarray) -> NDArray[np.bool_]:

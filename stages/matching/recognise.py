@@ -12,6 +12,7 @@ from stages.edges.planes import Camera
 from stages.matching.database import Database, Part, turn_profile
 from stages.matching.eigenspace import Match, matches
 from stages.matching.occlusion import covers
+from stages.matching.partial import name_by_what_shows
 from stages.matching.surfaces import (
     PROFILE_SECTORS,
     RING_PX,
@@ -66,6 +67,7 @@ class Rules:
     max_residual_mm: float = 1.0
     phi_scale: float = 1.0
     zeta_scale: float = 1.0
+    most_hidden: float = 0.2
 
 
 def match_part(
@@ -122,8 +124,9 @@ def find_candidates(
     Fields: ``label``, ``rank`` (by area), ``elevation_m``, ``area_mm2``, ``perimeter_mm``,
     ``shape_factor``, ``greatest_distance_mm``, ``occluded``, ``occluded_by`` (label, 0 none),
     ``occluded_share`` (of the border), ``distances`` [models], ``model`` (index of the best),
-    ``distance``, ``shape_distance`` and ``zeta`` (NaN unless under φ), ``mirrored``, ``reason``
-    (:class:`Reason`), ``picked``.
+    ``distance``, ``shape_distance`` and ``zeta`` (NaN unless under φ), ``mirrored``,
+    ``visible_model`` (what shows of an incomplete one is this part's; -1 none) and
+    ``hidden_share`` (of it, else NaN), ``reason`` (:class:`Reason`), ``picked``.
     """
     models = len(database.parts)
     kind = np.dtype(
@@ -134,12 +137,13 @@ def find_candidates(
             ("occluded", np.bool_), ("occluded_by", np.int32), ("occluded_share", np.float64),
             ("distances", np.float64, (models,)), ("model", np.int32), ("distance", np.float64),
             ("shape_distance", np.float64), ("zeta", np.float64), ("mirrored", np.bool_),
+            ("visible_model", np.int32), ("hidden_share", np.float64),
             ("reason", np.int32), ("picked", np.bool_),
         ]
     )  # fmt: skip
     above = covers(
         labels, regions["point_m"], regions["normal"], regions["residual_m"], camera,
-        rules.step_mm * 1e-3,
+        rules.step_mm * 1e-3, depth_m,
     )  # fmt: skip
     rows = []
     for region in regions[~regions["background"] & (regions["plane_px"] > 0)]:
@@ -153,8 +157,15 @@ def find_candidates(
         for name in ("perimeter_mm", "shape_factor", "greatest_distance_mm", "distances"):
             row[name] = np.nan
         row["model"], row["distance"] = -1, np.nan
-        row["shape_distance"] = row["zeta"] = np.nan
+        row["shape_distance"] = row["zeta"] = row["hidden_share"] = np.nan
+        row["visible_model"] = -1
         _judge(row, region, surface, above, depth_m, database, rules)
+        if row["reason"] in (Reason.CUT, Reason.OCCLUDED) and rules.most_hidden > 0:
+            shows = name_by_what_shows(
+                surface, int(row["label"]), labels, depth_m, database, rules.most_hidden
+            )
+            if shows.names(rules.most_hidden):
+                row["visible_model"], row["hidden_share"] = shows.model, shows.hidden_share
         rows.append(row)
     out = np.array(rows, kind) if rows else np.zeros(0, kind)
     out = out[np.argsort(-out["area_mm2"], kind="stable")]
@@ -221,19 +232,25 @@ def _judge(
 def explain_row(row: Any, database: Database, rules: Rules) -> str:
     """Why a candidate was refused, or that it is accepted, in one clause."""
     reason = Reason(int(row["reason"]))
+    shows = ""
+    if row["visible_model"] >= 0:
+        part = database.names[int(row["visible_model"])]
+        shows = f"; what shows is {part}'s, {100 * row['hidden_share']:.0f} % hidden"
     name = database.names[int(row["model"])] if row["model"] >= 0 else "none"
     if reason is Reason.TOO_SMALL:
         least = rules.min_area * database.smallest_mm2
         return f"area {row['area_mm2']:.0f} mm² under {least:.0f}"
     if reason is Reason.CUT:
-        return "leaves the image"
+        return f"leaves the image{shows}"
     if reason is Reason.TILTED:
         return f"tilt {row['tilt_deg']:.0f}° over {rules.max_tilt_deg:.0f}°"
     if reason is Reason.NOT_FLAT:
         return "not flat"
     if reason is Reason.OCCLUDED:
         share = 100 * row["occluded_share"]
-        return f"Occ: region {row['occluded_by']} is above it along {share:.0f} % of its border"
+        return (
+            f"Occ: region {row['occluded_by']} is above it along {share:.0f} % of its border{shows}"
+        )
     if reason is Reason.FEATURES:
         phi = rules.phi_scale * database.phi
         return f"features {row['distance']:.3f} from {name}, over φ {phi:.3f}"

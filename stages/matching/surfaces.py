@@ -30,6 +30,7 @@ __all__ = [
     "cut_out",
     "fall_off",
     "features_mm",
+    "grid_px",
     "shortest_turn",
     "soft_view",
     "upright_view",
@@ -146,18 +147,10 @@ def cut_out(
     )
 
 
-def upright_view(
+def grid_px(
     surface: Surface, side: int, mm_per_px: float, rotation_deg: float = 0.0, mirrored: bool = False
-) -> F32:
-    """The face seen along its normal, its centroid in the middle: [side side] float32, 0..1.
-
-    Args:
-        surface: what to look at.
-        side: pixels of the picture.
-        mm_per_px: its scale.
-        rotation_deg: the face is turned by this first, counter-clockwise as displayed.
-        mirrored: left and right are exchanged before the turn.
-    """
+) -> tuple[F64, F64]:
+    """Columns and rows [side side] of the image at which :func:`upright_view` looks."""
     half = (side - 1) / 2
     across = (np.arange(side) - half) * mm_per_px * 1e-3
     u, v = np.meshgrid(across, -across)
@@ -171,12 +164,29 @@ def upright_view(
     place = surface.origin_m + x[..., None] * axes[:, 0] + y[..., None] * axes[:, 1]
     camera = surface.camera
     depth = np.maximum(place[..., 2], 1e-6)
-    columns = camera.fx * place[..., 0] / depth + camera.cx - surface.corner[0]
-    rows = camera.fy * place[..., 1] / depth + camera.cy - surface.corner[1]
+    columns = camera.fx * place[..., 0] / depth + camera.cx
+    rows = camera.fy * place[..., 1] / depth + camera.cy
+    return columns, rows
+
+
+def upright_view(
+    surface: Surface, side: int, mm_per_px: float, rotation_deg: float = 0.0, mirrored: bool = False
+) -> F32:
+    """The face seen along its normal, its centroid in the middle: [side side] float32, 0..1.
+
+    Args:
+        surface: what to look at.
+        side: pixels of the picture.
+        mm_per_px: its scale.
+        rotation_deg: the face is turned by this first, counter-clockwise as displayed.
+        mirrored: left and right are exchanged before the turn.
+    """
+    columns, rows = grid_px(surface, side, mm_per_px, rotation_deg, mirrored)
+    left, top = surface.corner
     shown = cv2.remap(
         surface.mask,
-        columns.astype(np.float32),
-        rows.astype(np.float32),
+        (columns - left).astype(np.float32),
+        (rows - top).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,

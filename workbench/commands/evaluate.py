@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from workbench.console import closing_tables, end, interruptible, scores_beside, tracked
+from workbench.console import (
+    closing_tables,
+    end,
+    interruptible,
+    published_beside,
+    scores_beside,
+    tracked,
+)
 from workbench.errors import DataError
 from workbench.pipeline import ResultStore
 from workbench.plugins import find_stages
@@ -38,6 +45,7 @@ def run(options: Options, as_json: bool) -> None:
         print(to_json(report.as_dict() | {"presets": scores}))
     else:
         scores_beside({name: other.scores() for name, other in reports.items()})
+        published_beside(reports)
         closing_tables(report, scores=False)
     if report.frames and not report.scores():
         lacking = (

@@ -27,9 +27,11 @@ def run(
     assignments: Sequence[str],
     topics: Mapping[str, str],
     plugins: Sequence[Path],
+    save: Path | None,
+    screenshot: Path | None,
     as_json: bool,
 ) -> None:
-    """Train on the recordings, write the file and print its report."""
+    """Train on the recordings, write the file, print its report and show it where asked to."""
     stages = find_stages(plugins)
     procedure = procedure_of(stages, RESOURCE)
     own = [a for a in assignments if a.startswith("train.")]
@@ -40,6 +42,9 @@ def run(
         )
     degrees = _angles(angles)
     check_output("--output", output)
+    for flag, path in (("--save", save), ("--screenshot", screenshot)):
+        if path is not None:
+            check_output(flag, path)
     resources = {} if calibration is None else {procedure.resource: calibration}
     store = ResultStore(capacity_bytes=1)
     sessions = [
@@ -76,11 +81,25 @@ def run(
         for path, session in zip(paths, sessions, strict=True)
     ]
     made.save(output)
+    shown = [path for path in (save, screenshot) if path is not None]
+    if shown:
+        _show(made, save, screenshot)
     if as_json:
         print(to_json(made.report))
         return
     table("Models", ("quantity", "value"), report_rows(made.report))
-    out.print(f"wrote {output}", soft_wrap=True, markup=False)
+    for path in (output, *shown):
+        out.print(f"wrote {path}", soft_wrap=True, markup=False)
+
+
+def _show(made: Any, save: Path | None, screenshot: Path | None) -> None:
+    """Log what training made to a file, a picture or both."""
+    from workbench.digest import digest_of
+    from workbench.viewer import Destinations, opened
+
+    destinations = Destinations(save=save, screenshot=screenshot)
+    with opened(destinations, digest_of([to_json(made.report)])) as stream:
+        stream.recording.send_blueprint(made.log(stream.recording))
 
 
 def _bound(sessions: Sequence[Session], name: str) -> Any:
