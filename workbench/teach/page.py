@@ -196,10 +196,11 @@ class _LessonPage:
 
     def _start_viewer(self, viewer: str) -> None:
         assert self._client is not None
-        path = f"/stream/{self.lesson.number}"
+        # A page that comes again after a lost connection has its viewer already.
         self._client.run_javascript(
-            "if (!window.benchStarted) { window.benchStarted = true; "
-            f"bench.start('{viewer}', '{path}'); }}"
+            "if (!window.benchStream) { "
+            f"window.benchStream = '/stream/{self.lesson.number}'; "
+            f"bench.start('{viewer}', 'lesson'); }}"
         )
 
     def _build_bar(self) -> None:

@@ -6,7 +6,6 @@ window.bench = (() => {
   let socket = null;
   let pieces = 0;
   const channel = "bench";
-  let stream = "/stream";
 
   const say = (text, hidden) => {
     const cover = document.getElementById("viewer-cover");
@@ -17,7 +16,7 @@ window.bench = (() => {
 
   const feed = () => {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    socket = new WebSocket(`${scheme}://${location.host}${stream}`);
+    socket = new WebSocket(`${scheme}://${location.host}${window.benchStream || "/stream"}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => {
       handle.send_rrd_to_channel(channel, new Uint8Array(event.data));
@@ -41,8 +40,7 @@ window.bench = (() => {
     };
   };
 
-  const start = async (version, path = "/stream") => {
-    stream = path;
+  const start = async (version) => {
     const canvas = document.getElementById("viewer");
     // The viewer's graphics layer logs tens of thousands of lines, which take longer than it does.
     console.debug = () => {};
