@@ -40,6 +40,12 @@ def test_the_course_is_numbered_without_gaps() -> None:
     assert len({lesson.name for lesson in LESSONS}) == len(LESSONS)
 
 
+def test_no_two_lessons_draw_at_one_place() -> None:
+    """In a recording of the whole course one would be drawn over the other."""
+    shown = [name for lesson in LESSONS for name in lesson.shows]
+    assert len(set(shown)) == len(shown)
+
+
 def test_the_course_covers_the_paper() -> None:
     """What the project promised to teach, by the words of the lessons' own texts."""
     told = " ".join(lesson.page() for lesson in LESSONS)

@@ -26,7 +26,7 @@ FLAGS = (
     "--enable-unsafe-swiftshader",
 )
 # Software rendering pays for each pixel.
-SIZE = {"width": 1000, "height": 560}
+SIZE = {"width": 900, "height": 500}
 SECONDS = 60.0
 # The viewer would tell its maker that it runs; the page does not let it, and the viewer complains.
 OUTSIDE = re.compile(r"tel\.rerun\.io|Failed to fetch")
@@ -50,7 +50,7 @@ def until(condition: Callable[[], bool], what: str) -> None:
     deadline = time.monotonic() + SECONDS
     while not condition():
         assert time.monotonic() < deadline, what
-        time.sleep(0.1)
+        time.sleep(0.2)
 
 
 def drawn(page: Any) -> bool:

@@ -770,6 +770,12 @@ class PilePictures(Stage):
         ]
 
 
+class WarpPictures(PilePictures):
+    """The same for the lesson on warping, under a name of its own."""
+
+    name = "warp_pictures"
+
+
 def _faces_inside(truth: Any) -> np.ndarray:
     """Pixels of parts that are more than 6 px away from any edge of a face, bool [H W]."""
     import cv2
@@ -805,7 +811,7 @@ def _drift_px(run: Run) -> float:
     return float(run.artifacts["registration_drift_px"])
 
 
-_PILE = (Disturbance, Registration, FocusMaps, DepthCloud, PilePictures)
+_PILE = (Disturbance, Registration, FocusMaps, DepthCloud)
 
 MISREGISTRATION = Lesson(
     number=10,
@@ -823,7 +829,7 @@ In the picture at the upper left, what both images share is grey; red or cyan is
 them has. Move the far image by a pixel or two: inside a face the windows forgive it, but at every
 edge the two measures speak of different surfaces.
 """,
-    stages=_PILE,
+    stages=(*_PILE, PilePictures),
     knobs=("disturbance.shift_px", "registration.similarity"),
     shows=("pile_pictures",),
     settings={},
@@ -879,9 +885,9 @@ with a Lanczos kernel over 8×8 pixels, and warps alike when it calibrates.
 
 `disturbance.warp` chooses how the far image is moved by `shift_px`.
 """,
-    stages=_PILE,
+    stages=(*_PILE, WarpPictures),
     knobs=("disturbance.warp", "disturbance.shift_px"),
-    shows=("pile_pictures",),
+    shows=("warp_pictures",),
     settings={"disturbance.shift_px": 0.5, "depth_cloud.min_modulation": 0.0},
     recording=SCENE,
     frame=3,

@@ -92,7 +92,7 @@ def lesson_view(opened: OpenLesson, run: Run) -> Any:
         ),
         picture_views(opened, run),
         column_shares=[_TEXT_SHARE, _PICTURE_SHARE],
-        name=f"{lesson.number}. {lesson.title}",
+        name=f"{lesson.number} {lesson.name.replace('-', ' ')}",
     )
 
 
@@ -101,7 +101,7 @@ def saved_blueprint(views: Sequence[Any]) -> rrb.Blueprint:
     whole = views[0] if len(views) == 1 else rrb.Tabs(*views, active_tab=0)
     return rrb.Blueprint(
         whole,
-        rrb.TimePanel(state="collapsed", timeline=TURN_TIMELINE, play_state="paused"),
+        rrb.TimePanel(state="collapsed", timeline=TURN_TIMELINE, play_state="paused", fps=1.0),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
