@@ -309,14 +309,19 @@ def test_without_a_display_the_lesson_is_saved(bench: Any, tmp_path: Path) -> No
         (("--set", "lens.f_number=2.0"), 2, "--lesson N"),
         (("--lesson", "1", "--set", "lens.nothing=2.0", "--json"), 2, "no parameter 'nothing'"),
         (("--lesson", "1", "--set", "lens.f_number=0.1", "--json"), 2, "lens.f_number"),
+        (("--lesson", "1", "--set", "lens.f_number=0.1"), 2, "lens.f_number"),
+        (("--lesson", "1", "--save", "a.rrd", "--set", "lens.f_number=0.1"), 2, "lens.f_number"),
         (("--lesson", "1", "--save", "nowhere/a.rrd"), 1, "there is no folder"),
         (("--lesson", "1", "--screenshot", "a.png", "--window", "wide"), 2, "--window wide"),
     ],
 )
-def test_a_mistake_is_one_line(bench: Any, arguments: Any, code: int, says: str) -> None:
+def test_a_mistake_is_one_line(
+    bench: Any, tmp_path: Path, arguments: Any, code: int, says: str
+) -> None:
     ended = bench("teach", *arguments)
     assert ended.code == code
     assert says in ended.mistake
+    assert list(tmp_path.iterdir()) == []
 
 
 # -- what is committed of it ----------------------------------------------------------------------

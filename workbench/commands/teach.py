@@ -129,17 +129,18 @@ def _save(
     from workbench.viewer import Destinations, opened
 
     store = ResultStore()
+    # A mistake is told before there is a file.
+    openings = [OpenLesson.open(lesson, assignments, store) for lesson in lessons]
     seen: dict[int, list[Seen]] = {}
     views = []
     with opened(Destinations(save=path), _identity(lessons)) as stream:
         total = sum(len(lesson.claims) for lesson in lessons)
         try:
             with progress("save", total) as advance:
-                for lesson in lessons:
-                    opened_lesson = OpenLesson.open(lesson, assignments, store)
-                    views.append(lesson_view(opened_lesson, opened_lesson.run()))
-                    for one in log_saved(stream.recording, opened_lesson):
-                        seen.setdefault(lesson.number, []).append(one)
+                for here in openings:
+                    views.append(lesson_view(here, here.run()))
+                    for one in log_saved(stream.recording, here):
+                        seen.setdefault(here.lesson.number, []).append(one)
                         interrupts.check()
                         advance()
         finally:
@@ -182,6 +183,7 @@ def _live(
     from workbench.viewer import free_port, has_display, how_to_open
 
     if browser and not has_display():
+        OpenLesson.open(first, assignments)
         path = free_name(Path(f"lesson-{first.slug}.rrd"))
         check_output("--save", path)
         says = (
