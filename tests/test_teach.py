@@ -132,6 +132,22 @@ def test_a_knob_turned_to_its_end_is_shown_or_told(
                 claim.measure(run)
 
 
+@pytest.mark.parametrize("lesson", LESSONS, ids=IDS)
+def test_pictures_can_be_drawn_again(lesson: Lesson, opened: dict[int, OpenLesson]) -> None:
+    """A viewer that is open loses the colours of a context that is logged as static once more."""
+    from workbench.teach.show import log_pictures
+
+    class Watch:
+        def log(self, path: str, *entities: Any, static: bool = False, **_: Any) -> None:
+            assert not static, f"{path} is logged as static"
+            drawn.append(path)
+
+    drawn: list[str] = []
+    recording: Any = Watch()
+    log_pictures(recording, opened[lesson.number], opened[lesson.number].run())
+    assert len(drawn) == len(set(drawn)) > 1
+
+
 def test_the_same_lesson_gives_the_same_numbers(opened: dict[int, OpenLesson]) -> None:
     lesson = lesson_numbered(LESSONS, 9)
     first = [opened[9].check(claim) for claim in lesson.claims]
