@@ -68,11 +68,11 @@ def log_map(
             colormap=colours,
         ),
     )
-    recording.log(f"{path}/unknown", rr.SegmentationImage((~known).astype(np.uint8)))
+    # Not static: a viewer that is open loses the colours when they are logged so a second time.
     recording.log(
         f"{path}/unknown",
         rr.AnnotationContext([(0, "known", (0, 0, 0, 0)), (1, "unknown", UNKNOWN_COLOUR)]),
-        static=True,
+        rr.SegmentationImage((~known).astype(np.uint8)),
     )
     _log_bar(recording, path, image.shape, colours, ticks)
 

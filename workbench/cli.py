@@ -679,6 +679,34 @@ def sweep(
     command.run(request, view, screenshot, window, as_json)
 
 
+@app.command()
+def teach(
+    lesson: Annotated[int | None, typer.Option(help="Open this lesson.", metavar="N")] = None,
+    listing: Annotated[bool, typer.Option("--list", help="List the lessons.")] = False,
+    save: Annotated[
+        Path | None,
+        typer.Option(help="Write the lesson, or all of them, to this .rrd file to hand out."),
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(help="Take a picture (PNG) of the lesson; needs no screen.")
+    ] = None,
+    assignments: Set = None,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Serve the page and print its address only.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Check what the lessons claim and print it as JSON.")
+    ] = False,
+    window: Annotated[
+        str, typer.Option(help="Size of the screenshot's window.", metavar="WxH")
+    ] = "1600x900",
+) -> None:
+    """A course of short lessons: a text beside live pictures and a few knobs."""
+    from workbench.commands import teach as command
+
+    command.run(lesson, listing, save, screenshot, assignments or [], no_browser, as_json, window)
+
+
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
     interrupts.install()

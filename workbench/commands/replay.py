@@ -35,7 +35,7 @@ def run(
 
     native = not (web or save or screenshot)
     if native and not has_display():
-        native, save = False, _free_name(Path(f"{options.recording.stem}.rrd"))
+        native, save = False, free_name(Path(f"{options.recording.stem}.rrd"))
         check_output("--save", save)
         says = f"no display: saving {save} instead (open it with: {how_to_open(save)})"
         err.print(says, soft_wrap=True, markup=False)
@@ -75,7 +75,7 @@ def run(
     end(report)
 
 
-def _free_name(path: Path) -> Path:
+def free_name(path: Path) -> Path:
     """``path``, or the first of NAME-2, NAME-3, … that is not there: nobody asked to replace it."""
     number, free = 1, path
     while free.exists():

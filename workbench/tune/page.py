@@ -788,3 +788,9 @@ def _story_html(story: Story) -> str:
 
 
 _STYLE = Path(__file__).with_name("tune.css").read_text(encoding="utf-8")
+
+KnobRow = _KnobRow
+"""One parameter as a row of widgets, for pages of another kind than this module's.
+
+Its page has ``bench``, ``set``, ``tell``, ``_tried`` and ``_refresh`` as here.
+"""

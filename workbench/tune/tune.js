@@ -18,7 +18,7 @@ window.bench = (() => {
 
   const feed = () => {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    socket = new WebSocket(`${scheme}://${location.host}/stream`);
+    socket = new WebSocket(`${scheme}://${location.host}${window.benchStream || "/stream"}`);
     socket.binaryType = "arraybuffer";
     socket.onmessage = (event) => {
       handle.send_rrd_to_channel(channel, new Uint8Array(event.data));
