@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 SCENE = Path(__file__).parents[1] / "recordings" / "scene.mcap"
@@ -46,6 +47,53 @@ def test_a_recording_without_a_lone_part_is_one_line(tmp_path: Path) -> None:
 )
 def test_wrong_usage_is_one_line(tmp_path: Path, flags: list[str], says: str) -> None:
     assert says in one_line(workbench("train", SCENE, "-o", tmp_path / "m.npz", *flags), 2)
+
+
+POSES = SCENE.with_name("pose_bar.mcap")
+SIMULATED = SCENE.with_name("simulated.calibration.npz")
+
+
+def train(output: Path, *flags: object) -> subprocess.CompletedProcess[str]:
+    return workbench("train", POSES, "--calibration", SIMULATED, "-o", output, *flags)
+
+
+def test_name_and_angles_come_from_the_truth_or_from_the_flags(tmp_path: Path) -> None:
+    from stages.matching.database import Database
+
+    told, said = tmp_path / "told.npz", tmp_path / "said.npz"
+    done = train(told, "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["parts"]["bar"]["views"] == 6
+    assert report["recordings"][0]["name"] == "pose_bar.mcap"
+    done = train(said, "--label", "rod", "--angles", "100,115,130,145,160,175")
+    assert done.returncode == 0, done.stderr
+    bar, rod = (Database.load(path).parts[0] for path in (told, said))
+    assert (bar.name, rod.name) == ("bar", "rod")
+    np.testing.assert_allclose(bar.space.views_deg, np.arange(0, 90, 15))
+    np.testing.assert_allclose(rod.space.views_deg, bar.space.views_deg + 100)
+    # The features are of the views, whatever they are called.
+    np.testing.assert_array_equal(bar.features, rod.features)
+
+
+def test_too_few_angles_is_one_line(tmp_path: Path) -> None:
+    done = train(tmp_path / "m.npz", "--angles", "0,15")
+    assert "--angles: expected one for each frame, found 2" in one_line(done, 1)
+
+
+def test_training_can_be_seen(tmp_path: Path) -> None:
+    done = train(tmp_path / "m.npz", "--save", tmp_path / "m.rrd")
+    assert done.returncode == 0, done.stderr
+    assert f"wrote {tmp_path / 'm.rrd'}" in done.stdout
+    stored = rrd_entities(tmp_path / "m.rrd")
+    for name in ("mean", "eigenimages/picture", "variance", "manifold/curve", "manifold/labelled"):
+        assert f"/models/bar/{name}" in stored
+
+
+def rrd_entities(path: Path) -> set[str]:
+    from rerun.chunk import RrdReader
+
+    return {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
 
 
 def test_without_models_there_is_no_verdict_and_no_failure(tmp_path: Path) -> None:

@@ -323,7 +323,7 @@ def make_database(
         },
         "phi": phi,
         "farthest_within_a_part": within,
-        "nearest_between_parts": between,
+        **({"nearest_between_parts": between} if np.isfinite(between) else {}),
         "image_px": side,
         "mm_per_px": mm_per_px,
     }
