@@ -266,11 +266,16 @@ def take_screenshot(
             f"(Debian: mesa-vulkan-drivers): {error}"
         ) from error
     finally:
-        child.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(timeout=5)
-        if child.poll() is None:
-            child.kill()
+        _end(child)
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a child, gently first."""
+    child.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(timeout=5)
+    if child.poll() is None:
+        child.kill()
 
 
 def send_blueprint(recording: rr.RecordingStream, blueprint: Any) -> None:
@@ -317,11 +322,7 @@ def native_viewer(headless: bool = False) -> Iterator[tuple[int, subprocess.Pope
         _await_port(port, child)
         yield port, child
     finally:
-        child.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(timeout=5)
-        if child.poll() is None:
-            child.kill()
+        _end(child)
 
 
 def unpack_web_viewer(folder: Path) -> None:
@@ -360,8 +361,4 @@ def unpack_web_viewer(folder: Path) -> None:
     except OSError as error:
         raise DataError(f"Rerun's web viewer cannot be had: {error}") from error
     finally:
-        child.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            child.wait(timeout=5)
-        if child.poll() is None:
-            child.kill()
+        _end(child)

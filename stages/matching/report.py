@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from stages.matching.database import Database, Part
 from stages.matching.eigenspace import POINTS
 from stages.show import DARK
+
+if TYPE_CHECKING:
+    from stages.matching.database import Database, Part
 
 __all__ = ["blueprint", "log_database"]
 

@@ -6,7 +6,6 @@ the lesson is first opened and keeps its knobs as they were left.
 
 from __future__ import annotations
 
-import asyncio
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
@@ -16,7 +15,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 from fastapi import WebSocket
-from nicegui import Client, background_tasks, ui
+from nicegui import Client, ui
 from starlette.requests import Request
 from starlette.responses import RedirectResponse
 
@@ -28,11 +27,10 @@ from workbench.teach.course import OpenLesson
 from workbench.teach.lesson import Claim, Lesson, number
 from workbench.tune.canvas import Canvas, live_recording
 from workbench.tune.live import LiveBench, Part, Snapshot
-from workbench.tune.page import _STYLE, KnobRow
+from workbench.tune.page import STYLE, KnobRow
+from workbench.tune.refreshing import Refreshing
 from workbench.tune.server import Hub, application, new_token, serve
 from workbench.viewer import LOOPBACK, unpack_web_viewer
-
-_TOGETHER_SECONDS = 0.03
 
 
 class LessonCanvas(Canvas):
@@ -164,16 +162,13 @@ class _LessonPage:
         self._rows: list[KnobRow] = []
         self._claims: list[_ClaimCard] = []
         self._client: Client | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._refreshing = False
-        self._again = False
+        self._refreshing: Refreshing | None = None
         self._address = ""
 
     def build(self, query: Mapping[str, Sequence[str]]) -> None:
         """Make the page for the client that has come."""
         self._client = ui.context.client
-        self._loop = asyncio.get_running_loop()
-        ui.add_css(_STYLE + _OWN_STYLE)
+        ui.add_css(STYLE + _OWN_STYLE)
         ui.colors(primary="#4a9eff", dark="#0d1011", dark_page="#0d1011", accent="#ff8a3d")
         viewer = self.course.viewer_version
         ui.add_head_html(
@@ -188,7 +183,8 @@ class _LessonPage:
             with ui.element("div").classes("right"):
                 self._build_right()
         ui.keyboard(on_key=self._key, ignore=["input", "textarea"])
-        self._client.on_delete(self.bench.subscribe(self._changed))
+        self._refreshing = Refreshing(self._client, self._refresh)
+        self._client.on_delete(self.bench.subscribe(self._refreshing.changed))
         self._client.on_connect(lambda: self._start_viewer(viewer))
         if query:
             self._tried(lambda: self.bench.restore(query))
@@ -268,7 +264,8 @@ class _LessonPage:
             self.tell(one_line(error), "negative")
             self._refresh(force=True)
             return False
-        self._changed()
+        if self._refreshing is not None:
+            self._refreshing.changed()
         return True
 
     def tell(self, says: str, kind: str = "info") -> None:
@@ -292,31 +289,6 @@ class _LessonPage:
             self._tried(self.bench.undo)
 
     # -- showing the state ------------------------------------------------------------------------
-
-    def _changed(self) -> None:
-        """The bench has changed; called from any thread."""
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._schedule)
-
-    def _schedule(self) -> None:
-        if self._refreshing:
-            self._again = True
-            return
-        self._refreshing = True
-        background_tasks.create(self._refresh_soon())
-
-    async def _refresh_soon(self) -> None:
-        try:
-            while True:
-                self._again = False
-                if self._client is not None and not self._client.is_deleted:
-                    with self._client:
-                        self._refresh()
-                await asyncio.sleep(_TOGETHER_SECONDS)
-                if not self._again:
-                    return
-        finally:
-            self._refreshing = False
 
     def _refresh(self, force: bool = False) -> None:
         snapshot = self.bench.snapshot()

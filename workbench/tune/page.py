@@ -17,7 +17,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlencode
 
 import numpy as np
-from nicegui import Client, background_tasks, ui
+from nicegui import Client, ui
 
 from workbench.errors import DataError, UsageError, one_line
 from workbench.files import check_output
@@ -25,6 +25,7 @@ from workbench.report import write_beside
 from workbench.stage import Histogram, Knob
 from workbench.tune.canvas import Canvas
 from workbench.tune.live import LiveBench, Snapshot
+from workbench.tune.refreshing import Refreshing
 from workbench.why import Change, Story
 
 _DRAG_SECONDS = 0.04
@@ -39,6 +40,8 @@ _VIEWS = {
     "beside": "A beside B",
     "difference": "B less A",
 }
+
+STYLE = Path(__file__).with_name("tune.css").read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True)
@@ -76,9 +79,7 @@ class _Page:
         self.options = options
         self._stages: list[_StagePanel] = []
         self._client: Client | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._refreshing = False
-        self._again = False
+        self._refreshing: Refreshing | None = None
         self._address = ""
         self._asked = 0
 
@@ -87,8 +88,7 @@ class _Page:
     def build(self) -> None:
         """Make the page for the client that has come."""
         self._client = ui.context.client
-        self._loop = asyncio.get_running_loop()
-        ui.add_css(_STYLE)
+        ui.add_css(STYLE)
         ui.colors(primary="#4a9eff", dark="#0d1011", dark_page="#0d1011", accent="#ff8a3d")
         version = self.options.viewer_version
         ui.add_head_html(
@@ -107,7 +107,8 @@ class _Page:
         ui.keyboard(on_key=self._key, ignore=["input", "textarea"])
         ui.on("viewer_selection", self._clicked)
         ui.on("bench_restore", self._restore)
-        self._client.on_delete(self.bench.subscribe(self._changed))
+        self._refreshing = Refreshing(self._client, self._refresh)
+        self._client.on_delete(self.bench.subscribe(self._refreshing.changed))
         self._client.on_connect(lambda: self._start_viewer(version))
         self._refresh()
 
@@ -221,7 +222,8 @@ class _Page:
             self.tell(one_line(error), "negative")
             self._refresh(force=True)
             return False
-        self._changed()
+        if self._refreshing is not None:
+            self._refreshing.changed()
         return True
 
     def tell(self, says: str, kind: str = "info") -> None:
@@ -365,32 +367,6 @@ class _Page:
 
     # -- showing the state ------------------------------------------------------------------------
 
-    def _changed(self) -> None:
-        """The bench has changed; called from any thread."""
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._schedule)
-
-    def _schedule(self) -> None:
-        if self._refreshing:
-            self._again = True
-            return
-        self._refreshing = True
-        background_tasks.create(self._refresh_soon())
-
-    async def _refresh_soon(self) -> None:
-        try:
-            while True:
-                self._again = False
-                if self._client is not None and not self._client.is_deleted:
-                    with self._client:
-                        self._refresh()
-                # What changes within a moment is shown together.
-                await asyncio.sleep(0.03)
-                if not self._again:
-                    return
-        finally:
-            self._refreshing = False
-
     def _refresh(self, force: bool = False) -> None:
         snapshot = self.bench.snapshot()
         _set_value(self.preset, snapshot.settings.preset)
@@ -433,7 +409,7 @@ class _StagePanel:
     def __init__(self, page: _Page, name: str) -> None:
         self.page = page
         self.name = name
-        self.rows: list[_KnobRow] = []
+        self.rows: list[KnobRow] = []
         self.charts: list[ui.echart] = []
         self.drawn: Any = None
         self.expansion = ui.expansion().classes("stage").props("dense")
@@ -452,7 +428,7 @@ class _StagePanel:
                 ui.label(" ".join(doc.split())).classes("stage-doc")
             self.chart_box = ui.element("div").classes("charts")
             for knob in page.bench.knobs(name).values():
-                self.rows.append(_KnobRow(page, name, knob))
+                self.rows.append(KnobRow(page, name, knob))
         self.expansion.on_value_change(self._opened)
 
     def _opened(self, event: Any) -> None:
@@ -535,8 +511,11 @@ class _StagePanel:
         return chart
 
 
-class _KnobRow:
-    """One parameter: its name, its widget, its reset, and what it is for."""
+class KnobRow:
+    """One parameter: its name, its widget, its reset, and what it is for.
+
+    Its page has ``bench``, ``set``, ``tell``, ``_tried`` and ``_refresh``, as the one here does.
+    """
 
     def __init__(self, page: _Page, stage: str, knob: Knob) -> None:
         self.page = page
@@ -785,12 +764,3 @@ def _story_html(story: Story) -> str:
             f"<div class='told{subject}'><h4>{html.escape(told.stage)} {verdict}</h4>{lines}</div>"
         )
     return "".join(parts)
-
-
-_STYLE = Path(__file__).with_name("tune.css").read_text(encoding="utf-8")
-
-KnobRow = _KnobRow
-"""One parameter as a row of widgets, for pages of another kind than this module's.
-
-Its page has ``bench``, ``set``, ``tell``, ``_tried`` and ``_refresh`` as here.
-"""
