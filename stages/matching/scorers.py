@@ -356,6 +356,12 @@ class PoseScorer(Scorer):
             scores.append(
                 Score("rotation left open", float(self.open), "poses", note=note, better="lower")
             )
+        together = _Errors()
+        for errors in self.rotations.by_part.values():
+            together.take(astuple(errors))
+        if together.count:
+            note = "modulo each part's period"
+            scores += together.scores("rotation", "°", note, together.count / self.poses, "")
         for tilt, errors in sorted(self.rotations.by_tilt.items()):
             share, note = errors.count / self.poses, "modulo each part's period"
             published = "7.6 (2.1 % of a turn)" if tilt != "tilted farther" else "not promised"
