@@ -291,7 +291,7 @@ def make_database(
                 name,
                 np.array([features_mm(s) for s in surfaces]),
                 space,
-                _ZETA_OVER_VIEWS * float(apart.max()),
+                _ZETA_OVER_VIEWS * max(float(apart.max()), _border_distance(own, space, mm_per_px)),
                 profile,
                 noise,
                 _period_deg(space.order, profile, noise),
@@ -329,6 +329,21 @@ def make_database(
     }
     limited = tuple(replace(part, zeta=limit) for part, limit in zip(parts, zeta, strict=True))
     return Database(limited, mean, deviation, phi, side, mm_per_px, calibration, report)
+
+
+def _border_distance(views: Sequence[View], space: Eigenspace, mm_per_px: float) -> float:
+    """Distance at which a view lies whose border is off by as much as a border is uncertain.
+
+    A face that is larger by the factor k has its border moved outwards by (k - 1) 2 A / P in the
+    mean, A being its area and P its perimeter.
+    """
+    distances = []
+    for view in views:
+        area, perimeter = features_mm(view.surface)[:2]
+        larger = 1 + _BORDER_PX * _pixel_mm(view) * perimeter / (2 * area)
+        images = (soft_view(view.surface, space.side, mm_per_px / k) for k in (1.0, larger))
+        distances.append(float(np.linalg.norm(np.subtract(*images))) / space.norm)
+    return float(np.median(distances))
 
 
 def _pixel_mm(view: View) -> float:
