@@ -137,13 +137,14 @@ def read(path: Path) -> SavedReplay:
     except (RuntimeError, ValueError, OSError) as error:
         says = one_line(error).rpartition(f"{path}: ")[2]
         if "decode" in says:
-            says += f" (what is whole is saved by: rerun rrd optimize {path} -o whole.rrd)"
+            says += f" ({_saved_by(path)})"
         raise DataError(f"{path}: expected a saved replay (.rrd), found: {says}") from error
     provenance = _provenance(chunks)
     if provenance is None:
         raise DataError(
             f"{path}: expected a replay saved by workbench, found a recording of "
-            f"{recordings[0].application_id!r} without a replay's provenance"
+            f"{recordings[0].application_id!r} without a replay's provenance (if it was cut short, "
+            f"{_saved_by(path)})"
         )
     rows: dict[str, dict[int, dict[str, Any]]] = {}
     stamps_ns: dict[int, int] = {}
@@ -212,6 +213,10 @@ def owners_of(
 
 
 # -- what an .rrd holds ---------------------------------------------------------------------------
+
+
+def _saved_by(path: Path) -> str:
+    return f"what is whole is saved by: rerun rrd optimize {path} -o whole.rrd"
 
 
 def _provenance(chunks: Iterable[Any]) -> dict[str, list[str]] | None:
