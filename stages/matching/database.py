@@ -302,7 +302,7 @@ def make_database(
     patterns = np.concatenate([part.features for part in parts])
     mean = patterns.mean(axis=0)
     deviation = np.maximum(patterns.std(axis=0), _LEAST_SPREAD * np.abs(mean))
-    pixel_mm = float(np.median([_pixel_mm(view) for own in views.values() for view in own]))
+    pixel_mm = float(np.median([view.surface.pixel_mm for own in views.values() for view in own]))
     phi, within, between = _threshold(parts, mean, deviation, pixel_mm)
     zeta = _separate(parts)
     report = {
@@ -340,15 +340,10 @@ def _border_distance(views: Sequence[View], space: Eigenspace, mm_per_px: float)
     distances = []
     for view in views:
         area, perimeter = features_mm(view.surface)[:2]
-        larger = 1 + _BORDER_PX * _pixel_mm(view) * perimeter / (2 * area)
+        larger = 1 + _BORDER_PX * view.surface.pixel_mm * perimeter / (2 * area)
         images = (soft_view(view.surface, space.side, mm_per_px / k) for k in (1.0, larger))
         distances.append(float(np.linalg.norm(np.subtract(*images))) / space.norm)
     return float(np.median(distances))
-
-
-def _pixel_mm(view: View) -> float:
-    camera = view.surface.camera
-    return 1e3 * view.surface.z_m / max(camera.fx, camera.fy)
 
 
 def _border_error(parts: Sequence[Part], deviation: NDArray[np.float64], shift_mm: float) -> float:

@@ -86,7 +86,7 @@ def name_by_what_shows(
         depth_m: [H W] float32, NaN where unknown.
     """
     seen: tuple[F32, F32] | None = None
-    border_mm = _BORDER_PX * 1e3 * surface.z_m / max(surface.camera.fx, surface.camera.fy)
+    border_mm = _BORDER_PX * surface.pixel_mm
     fits = []
     for k, part in enumerate(database.parts):
         whole, perimeter = np.median(part.features[:, :2], axis=0)

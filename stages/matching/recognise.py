@@ -97,8 +97,7 @@ def contradiction(part: Part, surface: Surface, profile: np.ndarray, rotation_de
         return 0.0
     expected = turn_profile(part.profile, rotation_deg)
     body = turn_profile(part.body.astype(np.float64), rotation_deg) > 0.99
-    mm_per_px = 1e3 * surface.z_m / max(surface.camera.fx, surface.camera.fy)
-    out_mm = sum(RING_PX) / 2 * mm_per_px
+    out_mm = sum(RING_PX) / 2 * surface.pixel_mm
     towards = -surface.origin_m / np.linalg.norm(surface.origin_m) @ shortest_turn(surface.normal)
     angle = np.arange(PROFILE_SECTORS) * 2 * np.pi / PROFILE_SECTORS
     along = np.cos(angle) * towards[0] + np.sin(angle) * towards[1]

@@ -86,6 +86,11 @@ class Surface:
         """Depth of the centroid."""
         return float(self.origin_m[2])
 
+    @property
+    def pixel_mm(self) -> float:
+        """What a pixel spans at the centroid's depth, millimetres."""
+        return 1e3 * self.z_m / max(self.camera.fx, self.camera.fy)
+
 
 def shortest_turn(normal: np.ndarray) -> F64:
     """[3 3] camera_from_surface rotation of rotation 0: the viewing axis turned into ``normal``."""
@@ -214,7 +219,7 @@ def features_mm(surface: Surface) -> F64:
     face is too small to have an outline.
     """
     # As fine as the image saw it, so that nothing is lost and nothing invented.
-    mm_per_px = 1e3 * surface.z_m / max(surface.camera.fx, surface.camera.fy) * 0.75
+    mm_per_px = surface.pixel_mm * 0.75
     side = 2 * int(np.ceil(1.1 * surface.reach_mm / mm_per_px)) + 13
     view = cv2.GaussianBlur(upright_view(surface, side, mm_per_px), (0, 0), _OUTLINE_PX)
     outlines = find_contours(view, 0.5)  # type: ignore[no-untyped-call]
