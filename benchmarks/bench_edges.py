@@ -21,11 +21,11 @@ from rich.console import Console
 from rich.table import Table
 from skimage.feature import canny
 
-from stages.edges.inputs import best_depth
-from stages.edges.planes import Camera
-from stages.edges.regions import closed_regions, region_features
-from stages.edges.segmentation import PRESETS, link_edges, stack_edges
 from workbench.session import Options, Session
+from workbench_stages.edges.inputs import best_depth
+from workbench_stages.edges.planes import Camera
+from workbench_stages.edges.regions import closed_regions, region_features
+from workbench_stages.edges.segmentation import PRESETS, link_edges, stack_edges
 
 
 def to_regions(

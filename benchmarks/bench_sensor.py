@@ -28,11 +28,11 @@ from numba import set_num_threads
 from rich.console import Console
 from rich.table import Table
 
-from stages.dfd import depth as dfd
-from stages.dfd.calibration import Calibration
-from stages.dfd.focus import focus_map
-from stages.dfd.stripes import whole_period_taps
 from workbench.session import Options, Session
+from workbench_stages.dfd import depth as dfd
+from workbench_stages.dfd.calibration import Calibration
+from workbench_stages.dfd.focus import focus_map
+from workbench_stages.dfd.stripes import whole_period_taps
 
 SCENE = Path(__file__).parents[1] / "recordings" / "scene.mcap"
 SMALL_PX = 256

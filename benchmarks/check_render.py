@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.optics.rig import Rig
-from stages.simulation.again import bodies_of
-from stages.simulation.bodies import load_mesh
-from stages.simulation.render import render
-from stages.simulation.scene import Table
 from workbench.recording import Recording
+from workbench_stages.optics.rig import Rig
+from workbench_stages.simulation.again import bodies_of
+from workbench_stages.simulation.bodies import load_mesh
+from workbench_stages.simulation.render import render
+from workbench_stages.simulation.scene import Table
 
 PARTS = Path(__file__).parents[1] / "recordings" / "parts"
 EXPOSURE = 0.78 / 0.55

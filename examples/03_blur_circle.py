@@ -4,7 +4,7 @@ Prints the blur circle on both sensors over the distance, what the aperture does
 sign, not its size, tells one side of the focal plane from the other.
 """
 
-from stages.optics.rig import Rig
+from workbench_stages.optics.rig import Rig
 
 
 def main() -> None:

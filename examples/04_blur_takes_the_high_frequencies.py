@@ -6,9 +6,9 @@ the paper's Gaussian, and the focus measure of the fine ones.
 
 import numpy as np
 
-from stages.dfd.focus import focus_map
-from stages.dfd.stripes import whole_period_taps
-from stages.optics.analytic import disc_transfer
+from workbench_stages.dfd.focus import focus_map
+from workbench_stages.dfd.stripes import whole_period_taps
+from workbench_stages.optics.analytic import disc_transfer
 
 FINE_PX, COARSE_PX = 5.0, 40.0
 

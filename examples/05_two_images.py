@@ -5,8 +5,8 @@ Prints both focus measures and their ratio for planes at several distances, and 
 
 import numpy as np
 
-from stages.lessons.sensor import ratio_over_distance
-from stages.optics.rig import Projector, Rig
+from workbench_stages.lessons.sensor import ratio_over_distance
+from workbench_stages.optics.rig import Projector, Rig
 
 
 def main() -> None:

@@ -6,13 +6,13 @@ Prints how much of the plane has a depth with the pattern on, with it off, and w
 
 import numpy as np
 
-from stages.depth_cloud import DepthCloud
-from stages.focus_maps import FocusMaps
-from stages.lessons.sensor import CalibrationPlanes, Optics, Plane
-from stages.registration import Registration
 from workbench.pipeline import Pipeline
 from workbench.settings import resolve
 from workbench.teach.course import NO_FRAME
+from workbench_stages.depth_cloud import DepthCloud
+from workbench_stages.focus_maps import FocusMaps
+from workbench_stages.lessons.sensor import CalibrationPlanes, Optics, Plane
+from workbench_stages.registration import Registration
 
 STAGES = {s.name: s() for s in (Optics, Plane, CalibrationPlanes, Registration, FocusMaps,
                                 DepthCloud)}  # fmt: skip

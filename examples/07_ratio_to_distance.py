@@ -6,7 +6,7 @@ when the lens is stopped down and the sensor not calibrated again.
 
 import numpy as np
 
-from stages.lessons.sensor import CalibrationPlanes, Optics, ratio_over_distance
+from workbench_stages.lessons.sensor import CalibrationPlanes, Optics, ratio_over_distance
 
 
 def main() -> None:

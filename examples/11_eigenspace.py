@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.matching.database import Database
-from stages.matching.eigenspace import POINTS, match
+from workbench_stages.matching.database import Database
+from workbench_stages.matching.eigenspace import POINTS, match
 
 MODELS = Path(__file__).parent.parent / "recordings" / "scene.models.npz"
 

@@ -14,7 +14,7 @@ NEAR_CAMERA = recorded_camera("near", "intrinsics of the near sensor").optional(
 
 
 def _load_calibration(path: Path) -> Any:
-    from stages.dfd.calibration import Calibration
+    from .dfd.calibration import Calibration
 
     return Calibration.load(path)
 
@@ -24,13 +24,13 @@ CALIBRATION = Resource(
     doc="both steps of section 3.2",
     required=False,
     load=_load_calibration,
-    make="stages.dfd.procedure:Procedure",
+    make="workbench_stages.dfd.procedure:Procedure",
     filename="calibration.npz",
 )
 
 
 def _load_models(path: Path) -> Any:
-    from stages.matching.database import Database
+    from .matching.database import Database
 
     return Database.load(path)
 
@@ -40,7 +40,7 @@ MODELS = Resource(
     doc="features and eigenspaces of the parts (sections 5 and 6)",
     required=False,
     load=_load_models,
-    make="stages.matching.procedure:Procedure",
+    make="workbench_stages.matching.procedure:Procedure",
     filename="models.npz",
 )
 

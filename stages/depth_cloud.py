@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from stages.artifacts import (
+from workbench.stage import (
+    WARNINGS,
+    Cut,
+    Finding,
+    Histogram,
+    Inputs,
+    Logged,
+    Outputs,
+    Score,
+    Scorer,
+    Stage,
+    StageParameters,
+    knob,
+)
+
+from .artifacts import (
     CALIBRATION,
     CLOUD,
     CLOUD_INTENSITY,
@@ -23,20 +38,6 @@ from stages.artifacts import (
     RELATIVE,
     SATURATED,
     STRIPES,
-)
-from workbench.stage import (
-    WARNINGS,
-    Cut,
-    Finding,
-    Histogram,
-    Inputs,
-    Logged,
-    Outputs,
-    Score,
-    Scorer,
-    Stage,
-    StageParameters,
-    knob,
 )
 
 RELATIVE_NOTE = "no calibration: depth is relative (0 near, 1 far), not metres"
@@ -137,14 +138,14 @@ class DepthCloud(Stage):
 
     presets = {"paper": {"edge_aware": False, "smoothing_periods": 0.2, "min_confidence": 0.1}}
 
-    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+    def compute(self, inputs: Inputs, parameters: Any) -> Iterator[Outputs]:
         import numpy as np
 
-        from stages.dfd import depth as dfd
+        from .dfd import depth as dfd
 
         calibration = inputs["calibration"]
         measured = _measure(inputs, parameters)
-        windows, relative, confidence = measured.windows, measured.relative, measured.confidence
+        relative, confidence = measured.relative, measured.confidence
         relative[_unsure(measured, parameters)] = np.nan
         if calibration is not None and calibration.modulation.size:
             folded = dfd.folded_back(
@@ -163,40 +164,19 @@ class DepthCloud(Stage):
             depth_m = np.full_like(relative, np.nan)
         else:
             depth_m = calibration.z_m(relative)
-        camera = inputs["near_camera"]
-        height, width = depth_m.shape
-        if calibration is not None and camera is None:
-            warnings.append("no camera calibration in the recording: no point cloud")
-        elif camera is not None and (camera.width, camera.height) != (width, height):
-            warnings.append(
-                f"the camera calibration is for {camera.width}×{camera.height} pixels, the images "
-                f"are {width}×{height}: no point cloud"
-            )
-            camera = None
-        if calibration is None or camera is None:
-            points = normals = np.zeros((0, 3), np.float32)
-            shade = np.zeros(0, np.float32)
-        else:
-            from stages.dfd.cloud import cloud_from_depth
-
-            points, normals, shade = cloud_from_depth(
-                depth_m, inputs["intensity"], camera, windows.slope_px
-            )
-        return {
+        yield {
             "depth_m": depth_m,
             "depth_relative": relative,
             "confidence": confidence,
-            "cloud_xyz_m": points,
-            "cloud_normals": normals,
-            "cloud_intensity": shade,
             WARNINGS: warnings,
         }
+        yield _cloud(depth_m, inputs, measured.windows.slope_px)
 
     def log(self, recording: Any, logged: Logged) -> None:
         import numpy as np
         import rerun as rr
 
-        from stages import show
+        from . import show
 
         artifacts = logged.artifacts
         depth_m, confidence = artifacts["depth_m"], artifacts["confidence"]
@@ -225,27 +205,27 @@ class DepthCloud(Stage):
         show.log_map(
             recording, "depth_cloud/confidence", confidence, 0, 1, "viridis", ("0", "0.5", "1")
         )
-        camera = artifacts.get("near_camera")
-        if camera is not None:
+        camera, points = artifacts.get("near_camera"), artifacts.get("cloud_xyz_m")
+        if camera is not None and points is not None:
             recording.log("world", rr.ViewCoordinates.RDF, static=True)
             recording.log(
                 "world/camera",
                 rr.Pinhole(
                     image_from_camera=camera.K,
                     resolution=(camera.width, camera.height),
-                    image_plane_distance=_frustum_m(artifacts["cloud_xyz_m"]),
+                    image_plane_distance=_frustum_m(points),
                 ),
             )
             recording.log("world/camera/image", show.grey_image(artifacts["intensity"]))
-        points = artifacts["cloud_xyz_m"]
-        shade = artifacts["cloud_intensity"]
-        top = max(float(shade.max(initial=0)), 1e-6)
-        grey = np.clip(40 + 215 * shade / top, 0, 255).astype(np.uint8)
-        recording.log(
-            "world/cloud",
-            rr.Points3D(points, colors=np.repeat(grey[:, None], 3, axis=1), radii=0.0003),
-        )
-        if len(points):
+        if points is not None:
+            shade = artifacts["cloud_intensity"]
+            top = max(float(shade.max(initial=0)), 1e-6)
+            grey = np.clip(40 + 215 * shade / top, 0, 255).astype(np.uint8)
+            recording.log(
+                "world/cloud",
+                rr.Points3D(points, colors=np.repeat(grey[:, None], 3, axis=1), radii=0.0003),
+            )
+        if points is not None and len(points):
             some = slice(None, None, 53)
             recording.log(
                 "world/cloud/normals",
@@ -267,7 +247,7 @@ class DepthCloud(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import DARK, eye_above, map_view
+        from .show import DARK, eye_above, map_view
 
         shape = logged.artifacts["depth_m"].shape
         calibrated = logged.artifacts.get("calibration") is not None
@@ -284,8 +264,8 @@ class DepthCloud(Stage):
                 map_view("depth_cloud/error_mm", "depth minus truth (blue: too near)", shape)
             )
         columns: list[Any] = [rrb.Vertical(*pictures, name=self.name)]
-        points = logged.artifacts["cloud_xyz_m"]
-        if len(points):
+        points = logged.artifacts.get("cloud_xyz_m")
+        if points is not None and len(points):
             columns.append(
                 rrb.Spatial3DView(
                     origin="world",
@@ -299,8 +279,8 @@ class DepthCloud(Stage):
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
         import numpy as np
 
-        from stages.dfd import depth as dfd
-        from stages.wording import apart
+        from .dfd import depth as dfd
+        from .wording import apart
 
         calibration = artifacts.get("calibration")
         # What was unknown is NaN in the artifacts: its values are measured again.
@@ -407,7 +387,7 @@ class DepthCloud(Stage):
         return [Histogram("confidence", edges, counts, [least])]
 
     def scorer(self) -> Scorer:
-        from stages.dfd.score import DepthScorer
+        from .dfd.score import DepthScorer
 
         return DepthScorer()
 
@@ -422,9 +402,39 @@ class DepthCloud(Stage):
         ]
 
     def picture(self, artifacts: Mapping[str, Any]) -> Any:
-        from stages.pictures import depth_rgb
+        from .pictures import depth_rgb
 
         return depth_rgb(artifacts["depth_relative"], 0.0, 1.0)
+
+
+def _cloud(depth_m: Any, inputs: Inputs, reach_px: int) -> Outputs:
+    """The cloud of a depth map; empty, with a warning, where it cannot be placed in space."""
+    import numpy as np
+
+    from .dfd.cloud import cloud_from_depth
+
+    calibration, camera = inputs["calibration"], inputs["near_camera"]
+    height, width = depth_m.shape
+    warnings = []
+    if calibration is not None and camera is None:
+        warnings.append("no camera calibration in the recording: no point cloud")
+    elif camera is not None and (camera.width, camera.height) != (width, height):
+        warnings.append(
+            f"the camera calibration is for {camera.width}×{camera.height} pixels, the images "
+            f"are {width}×{height}: no point cloud"
+        )
+        camera = None
+    if calibration is None or camera is None:
+        points = normals = np.zeros((0, 3), np.float32)
+        shade = np.zeros(0, np.float32)
+    else:
+        points, normals, shade = cloud_from_depth(depth_m, inputs["intensity"], camera, reach_px)
+    return {
+        "cloud_xyz_m": points,
+        "cloud_normals": normals,
+        "cloud_intensity": shade,
+        WARNINGS: warnings,
+    }
 
 
 @dataclass(frozen=True)
@@ -468,9 +478,9 @@ def _measure(inputs: Mapping[str, Any], parameters: Any) -> _Measured:
     import cv2
     import numpy as np
 
-    from stages.dfd import depth as dfd
-    from stages.dfd.focus import SensorNoise
-    from stages.dfd.stripes import whole_period_taps
+    from .dfd import depth as dfd
+    from .dfd.focus import SensorNoise
+    from .dfd.stripes import whole_period_taps
 
     calibration, stripes = inputs["calibration"], inputs["stripes"]
     near, far = inputs["near"], inputs["far"]

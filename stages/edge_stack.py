@@ -6,18 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from stages.artifacts import (
-    DEPTH,
-    EDGE_CHOICE,
-    EDGES_HIGH,
-    EDGES_LOW,
-    EDGES_MEDIUM,
-    FULL_SCALE,
-    GRADIENT,
-    INTENSITY,
-    RELATIVE,
-)
-from stages.edges.presets import PRESETS
 from workbench.stage import (
     WARNINGS,
     Cut,
@@ -31,6 +19,19 @@ from workbench.stage import (
     StageParameters,
     knob,
 )
+
+from .artifacts import (
+    DEPTH,
+    EDGE_CHOICE,
+    EDGES_HIGH,
+    EDGES_LOW,
+    EDGES_MEDIUM,
+    FULL_SCALE,
+    GRADIENT,
+    INTENSITY,
+    RELATIVE,
+)
+from .edges.presets import PRESETS
 
 
 class EdgeStackStage(Stage):
@@ -121,8 +122,8 @@ class EdgeStackStage(Stage):
     presets = {"paper": PRESETS["paper"]["edge_stack"]}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.edges.inputs import best_depth
-        from stages.edges.segmentation import stack_edges
+        from .edges.inputs import best_depth
+        from .edges.segmentation import stack_edges
 
         depth, _ = best_depth(inputs)
         top = inputs["full_scale"]
@@ -150,7 +151,7 @@ class EdgeStackStage(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import numpy as np
 
-        from stages.show import edge_image, log_chart, log_map
+        from .show import edge_image, log_chart, log_map
 
         artifacts = logged.artifacts
         stack = artifacts["edge_choice"].stack
@@ -180,7 +181,7 @@ class EdgeStackStage(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import chart_view, map_view
+        from .show import chart_view, map_view
 
         shape = logged.artifacts["gradient"].shape
         unit = "σ" if logged.parameters.noise_units else "grey levels"
@@ -200,7 +201,7 @@ class EdgeStackStage(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.wording import apart
+        from .wording import apart
 
         chosen = artifacts["edge_choice"]
         stack = chosen.stack
@@ -296,6 +297,6 @@ class EdgeStackStage(Stage):
         return [Histogram("gradient along its ridges", edges, counts, cuts, unit, log_axis=True)]
 
     def scorer(self) -> Scorer:
-        from stages.edges.scorers import EdgeScorer
+        from .edges.scorers import EdgeScorer
 
         return EdgeScorer({"edges_high": "before reconstruction"})

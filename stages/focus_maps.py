@@ -5,15 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from stages.artifacts import (
-    CALIBRATION,
-    FAR,
-    FOCUS_FAR,
-    FOCUS_NEAR,
-    FOCUS_NOISE,
-    NEAR,
-    STRIPES,
-)
 from workbench.stage import (
     WARNINGS,
     Finding,
@@ -23,6 +14,16 @@ from workbench.stage import (
     Stage,
     StageParameters,
     knob,
+)
+
+from .artifacts import (
+    CALIBRATION,
+    FAR,
+    FOCUS_FAR,
+    FOCUS_NEAR,
+    FOCUS_NOISE,
+    NEAR,
+    STRIPES,
 )
 
 
@@ -72,9 +73,9 @@ class FocusMaps(Stage):
     presets = {"paper": {"window_periods": 2, "subtract_noise": False}}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.dfd.focus import SensorNoise, focus_map
-        from stages.dfd.stripes import whole_period_taps
-        from stages.dfd.texture import texture_focus_maps, texture_taps
+        from .dfd.focus import SensorNoise, focus_map
+        from .dfd.stripes import whole_period_taps
+        from .dfd.texture import texture_focus_maps, texture_taps
 
         calibration = inputs["calibration"]
         warnings = []
@@ -108,7 +109,7 @@ class FocusMaps(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.show import log_map
+        from .show import log_map
 
         near, far = logged.artifacts["focus_near"], logged.artifacts["focus_far"]
         # One scale for both, or their comparison, which is the whole point, would be lost.
@@ -120,7 +121,7 @@ class FocusMaps(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import map_view
+        from .show import map_view
 
         shape = logged.artifacts["focus_near"].shape
         return [

@@ -5,7 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from stages.artifacts import (
+from workbench.stage import (
+    Finding,
+    Inputs,
+    Logged,
+    Outputs,
+    Score,
+    Scorer,
+    Stage,
+    StageParameters,
+    knob,
+)
+
+from .artifacts import (
     DEPTH,
     DIRECTIONS,
     EDGE_CHOICE,
@@ -20,18 +32,7 @@ from stages.artifacts import (
     RELATIVE,
     TERMINATORS,
 )
-from stages.edges.presets import PRESETS
-from workbench.stage import (
-    Finding,
-    Inputs,
-    Logged,
-    Outputs,
-    Score,
-    Scorer,
-    Stage,
-    StageParameters,
-    knob,
-)
+from .edges.presets import PRESETS
 
 _FIRST_WINDOW_PX = 3.0
 _WINDOW_STEP_PX = 3.0
@@ -42,7 +43,7 @@ class LinkedEdges(Stage):
     the gaps from the ends of lines.
 
     Every pixel carries which step admitted or rejected it (``edge_step``, the numbers of
-    ``stages.edges.linking.Step``) and the value by which it did (``edge_value``).  ``paper``
+    ``edges.linking.Step``) and the value by which it did (``edge_value``).  ``paper``
     links terminators by geometry alone; ``default`` also weighs what the gradient says along the
     link, lets corners link as ends do, and lets depth steps and creases close what intensity
     cannot.
@@ -193,8 +194,8 @@ class LinkedEdges(Stage):
     presets = {"paper": PRESETS["paper"]["linked_edges"]}
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.edges.inputs import best_depth
-        from stages.edges.segmentation import link_edges
+        from .edges.inputs import best_depth
+        from .edges.segmentation import link_edges
 
         values = parameters.model_dump()
         reach, direction_length = values.pop("reach"), values.pop("direction_length")
@@ -222,7 +223,7 @@ class LinkedEdges(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr
 
-        from stages.show import edge_image, linked_image
+        from .show import edge_image, linked_image
 
         artifacts = logged.artifacts
         done = artifacts["linking"].reconstruction
@@ -264,7 +265,7 @@ class LinkedEdges(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.edges.stories import linking_story, nearest_end
+        from .edges.stories import linking_story, nearest_end
 
         edge, line = bool(artifacts["edges_linked"][y, x]), bool(artifacts["region_lines"][y, x])
         verdict = "edge" if edge else "line on the background" if line else "no edge"
@@ -283,7 +284,7 @@ class LinkedEdges(Stage):
         return findings
 
     def scorer(self) -> Scorer:
-        from stages.edges.scorers import EdgeScorer
+        from .edges.scorers import EdgeScorer
 
         return EdgeScorer({"edges_reconstructed": "reconstructed", "edges_linked": "linked"})
 
@@ -295,7 +296,7 @@ class LinkedEdges(Stage):
         return [Score("linked terminators", 1 - left / ends, better="higher")]
 
     def picture(self, artifacts: Mapping[str, Any]) -> Any:
-        from stages.pictures import linked_rgb
+        from .pictures import linked_rgb
 
         return linked_rgb(artifacts["edge_step"], artifacts["region_lines"])
 

@@ -16,7 +16,7 @@ _OVERLAY = 0.55
 
 def linked_rgb(step: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Lines [H W] by the step that drew them: the paper shades its links (figure 7)."""
-    from stages.edges.linking import Step
+    from .edges.linking import Step
 
     rgb = np.full((*step.shape, 3), DARK, np.uint8)
     rgb[lines] = _SHADOW_COLOUR

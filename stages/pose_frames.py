@@ -5,17 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from stages.artifacts import (
-    CANDIDATES,
-    DEPTH,
-    INTENSITY,
-    LABELS,
-    MODELS,
-    NEAR_CAMERA,
-    POSES,
-    REGIONS,
-    VERDICT,
-)
 from workbench.stage import (
     WARNINGS,
     Finding,
@@ -26,6 +15,18 @@ from workbench.stage import (
     Stage,
     StageParameters,
     knob,
+)
+
+from .artifacts import (
+    CANDIDATES,
+    DEPTH,
+    INTENSITY,
+    LABELS,
+    MODELS,
+    NEAR_CAMERA,
+    POSES,
+    REGIONS,
+    VERDICT,
 )
 
 PATH = "pose_frames"
@@ -68,9 +69,9 @@ class PoseFrames(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.edges.inputs import best_depth
-        from stages.matching.pose import pose_of
-        from stages.matching.surfaces import cut_out
+        from .edges.inputs import best_depth
+        from .matching.pose import pose_of
+        from .matching.surfaces import cut_out
 
         database, verdict = inputs["models"], inputs["verdict"]
         depth, camera = best_depth(inputs)
@@ -104,9 +105,9 @@ class PoseFrames(Stage):
         import numpy as np
         import rerun as rr
 
-        from stages.matching.pose import outline_m, project
-        from stages.matching.show import AXIS_COLOURS, MODEL_COLOUR, axes_of, pose_page
-        from stages.show import grey_image
+        from .matching.pose import outline_m, project
+        from .matching.show import AXIS_COLOURS, MODEL_COLOUR, axes_of, pose_page
+        from .show import grey_image
 
         artifacts = logged.artifacts
         recording.log(f"{PATH}/intensity", grey_image(artifacts["intensity"]))
@@ -146,10 +147,9 @@ class PoseFrames(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.show import DARK, eye_above
+        from .show import DARK, eye_above
 
-        points = logged.artifacts["cloud_xyz_m"]
-
+        points = logged.artifacts.get("cloud_xyz_m")
         return [
             rrb.Spatial2DView(
                 origin=PATH,
@@ -160,13 +160,13 @@ class PoseFrames(Stage):
                 origin=f"{PATH}/space",
                 name="pose in space",
                 background=DARK,
-                eye_controls=eye_above(points) if len(points) else None,
+                eye_controls=None if points is None or not len(points) else eye_above(points),
             ),
             rrb.TextDocumentView(origin=f"{PATH}/text", name="pose and grasp"),
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.wording import apart
+        from .wording import apart
 
         label = int(artifacts["labels"][y, x])
         about = f"region {label}" if label else "no region"
@@ -198,6 +198,6 @@ class PoseFrames(Stage):
         ]
 
     def scorer(self) -> Scorer:
-        from stages.matching.scorers import PoseScorer
+        from .matching.scorers import PoseScorer
 
         return PoseScorer()

@@ -5,17 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from stages.artifacts import (
-    CALIBRATION,
-    CANDIDATES,
-    DEPTH,
-    INTENSITY,
-    LABELS,
-    MODELS,
-    NEAR_CAMERA,
-    REGIONS,
-    VERDICT,
-)
 from workbench.errors import DataError
 from workbench.stage import (
     Finding,
@@ -27,6 +16,18 @@ from workbench.stage import (
     Stage,
     StageParameters,
     knob,
+)
+
+from .artifacts import (
+    CALIBRATION,
+    CANDIDATES,
+    DEPTH,
+    INTENSITY,
+    LABELS,
+    MODELS,
+    NEAR_CAMERA,
+    REGIONS,
+    VERDICT,
 )
 
 PATH = "recognition"
@@ -136,8 +137,8 @@ class Recognition(Stage):
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         import numpy as np
 
-        from stages.edges.inputs import best_depth
-        from stages.matching.recognise import find_candidates, verdict_of
+        from .edges.inputs import best_depth
+        from .matching.recognise import find_candidates, verdict_of
 
         database = inputs["models"]
         depth, camera = best_depth(inputs)
@@ -156,8 +157,8 @@ class Recognition(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr
 
-        from stages.matching.show import candidate_marks, candidates_page, region_outlines
-        from stages.show import grey_image
+        from .matching.show import candidate_marks, candidates_page, region_outlines
+        from .show import grey_image
 
         artifacts = logged.artifacts
         recording.log(f"{PATH}/intensity", grey_image(artifacts["intensity"]))
@@ -207,8 +208,8 @@ class Recognition(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.edges.stories import on_line
-        from stages.matching.recognise import Reason, checks, explain_row
+        from .edges.stories import on_line
+        from .matching.recognise import Reason, checks, explain_row
 
         label = int(artifacts["labels"][y, x])
         candidates, database = artifacts["candidates"], artifacts.get("models")
@@ -258,7 +259,7 @@ class Recognition(Stage):
         return [*findings, Finding(says, values, None, "not the highest", beside)]
 
     def scorer(self) -> Scorer:
-        from stages.matching.scorers import RecognitionScorer
+        from .matching.scorers import RecognitionScorer
 
         return RecognitionScorer()
 
@@ -271,7 +272,7 @@ class Recognition(Stage):
 
 def rules_of(parameters: Any) -> Any:
     """The stage's parameters as the mathematics takes them."""
-    from stages.matching.recognise import Rules
+    from .matching.recognise import Rules
 
     return Rules(
         parameters.min_area,

@@ -5,16 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from stages.artifacts import (
-    DEPTH,
-    EDGE_CHOICE,
-    INTENSITY,
-    LABELS,
-    LINKING,
-    NEAR_CAMERA,
-    REGION_LINES,
-    REGIONS,
-)
 from workbench.stage import (
     Finding,
     Inputs,
@@ -25,6 +15,17 @@ from workbench.stage import (
     Stage,
     StageParameters,
     knob,
+)
+
+from .artifacts import (
+    DEPTH,
+    EDGE_CHOICE,
+    INTENSITY,
+    LABELS,
+    LINKING,
+    NEAR_CAMERA,
+    REGION_LINES,
+    REGIONS,
 )
 
 
@@ -67,8 +68,8 @@ class RegionFeatures(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.edges.inputs import best_depth
-        from stages.edges.regions import closed_regions, region_features
+        from .edges.inputs import best_depth
+        from .edges.regions import closed_regions, region_features
 
         walls = inputs["linking"].walls
         labels = closed_regions(
@@ -91,7 +92,7 @@ class RegionFeatures(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr
 
-        from stages.show import grey_image
+        from .show import grey_image
 
         artifacts = logged.artifacts
         regions = artifacts["regions"]
@@ -129,8 +130,8 @@ class RegionFeatures(Stage):
         ]
 
     def explain(self, x: int, y: int, artifacts: Mapping[str, Any], p: Any) -> list[Finding]:
-        from stages.edges.regions import least_area_px
-        from stages.edges.stories import enclosed_px, on_line
+        from .edges.regions import least_area_px
+        from .edges.stories import enclosed_px, on_line
 
         label = int(artifacts["labels"][y, x])
         walls = artifacts["linking"].walls
@@ -184,12 +185,12 @@ class RegionFeatures(Stage):
         return [*findings, Finding(said, values, None, "region", about)]
 
     def scorer(self) -> Scorer:
-        from stages.edges.scorers import RegionScorer
+        from .edges.scorers import RegionScorer
 
         return RegionScorer()
 
     def figures(self, artifacts: Mapping[str, Any]) -> list[Score]:
-        from stages.edges.regions import closed_share
+        from .edges.regions import closed_share
 
         count = int((~artifacts["regions"]["background"]).sum())
         share = closed_share(artifacts["labels"], artifacts["region_lines"])
@@ -199,7 +200,7 @@ class RegionFeatures(Stage):
         ]
 
     def picture(self, artifacts: Mapping[str, Any]) -> Any:
-        from stages.pictures import regions_rgb
+        from .pictures import regions_rgb
 
         return regions_rgb(artifacts["intensity"], artifacts["labels"], artifacts["regions"])
 

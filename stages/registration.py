@@ -5,7 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from stages.artifacts import (
+from workbench.stage import (
+    WARNINGS,
+    Finding,
+    Inputs,
+    Logged,
+    Outputs,
+    Stage,
+    StageError,
+    StageParameters,
+    knob,
+)
+
+from .artifacts import (
     CALIBRATION,
     DRIFT,
     FAR,
@@ -18,17 +30,6 @@ from stages.artifacts import (
     NEAR_IMAGE,
     SATURATED,
     STRIPES,
-)
-from workbench.stage import (
-    WARNINGS,
-    Finding,
-    Inputs,
-    Logged,
-    Outputs,
-    Stage,
-    StageError,
-    StageParameters,
-    knob,
 )
 
 _DRIFT_WARNING_PX = 0.5
@@ -81,16 +82,16 @@ class Registration(Stage):
         import cv2
         import numpy as np
 
-        from stages.dfd.calibration import light_ratio, pair_gain
-        from stages.dfd.images import full_scale, grey
-        from stages.dfd.similarity import (
+        from .dfd.calibration import light_ratio, pair_gain
+        from .dfd.images import full_scale, grey
+        from .dfd.similarity import (
             Similarity,
             align_pair,
             misalignment_rms_px,
             refine_similarity,
         )
-        from stages.dfd.similarity import warp_to_near as warp
-        from stages.dfd.stripes import average_over_period, measure_stripes
+        from .dfd.similarity import warp_to_near as warp
+        from .dfd.stripes import average_over_period, measure_stripes
 
         near_raw, far_raw = inputs["near_image"], inputs["far_image"]
         if near_raw.shape[:2] != far_raw.shape[:2]:
@@ -190,7 +191,7 @@ class Registration(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr
 
-        from stages.show import grey_image, overlap
+        from .show import grey_image, overlap
 
         artifacts = logged.artifacts
         recording.log("registration/overlap", overlap(artifacts["near"], artifacts["far"]))

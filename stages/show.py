@@ -15,8 +15,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from stages.pictures import DARK as DARK
-from stages.pictures import UNKNOWN_COLOUR, linked_rgb
+from .pictures import DARK as DARK
+from .pictures import UNKNOWN_COLOUR, linked_rgb
 
 _CHART_WIDTH, _CHART_HEIGHT = 100.0, 60.0
 _TICK_COLOUR = (90, 150, 215)  # readable on the labels of the dark and of the light theme

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from stages.edges.linking import Step
-from stages.matching.recognise import Reason
 from workbench.pipeline import Pipeline
 from workbench.why import StageStory, Story
+from workbench_stages.edges.linking import Step
+from workbench_stages.matching.recognise import Reason
 
 _JOINED = {Step.MEDIUM, Step.HIGH}
 _SHORT = {Step.SHORT_MEDIUM, Step.SHORT_HIGH}

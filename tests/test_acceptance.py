@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import workbench
-from stages.edge_stack import EdgeStackStage
-from stages.edges.linking import Step
-from stages.edges.segmentation import link_edges, stack_edges
-from stages.linked_edges import LinkedEdges, windows_up_to
 from workbench.pipeline import Run
 from workbench.report import RunReport
 from workbench.stage import Score
+from workbench_stages.edge_stack import EdgeStackStage
+from workbench_stages.edges.linking import Step
+from workbench_stages.edges.segmentation import link_edges, stack_edges
+from workbench_stages.linked_edges import LinkedEdges, windows_up_to
 
 SCENE = Path(__file__).parent.parent / "recordings" / "scene.mcap"
 

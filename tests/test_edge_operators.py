@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from edge_scenes import eight, scene
 
-from stages.edges import operators as ops
+from workbench_stages.edges import operators as ops
 
 
 def reference_gef(image, a0):

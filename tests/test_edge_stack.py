@@ -6,8 +6,8 @@ from edge_scenes import eight, scene
 from scipy import ndimage
 from skimage.filters import apply_hysteresis_threshold
 
-from stages.edges.operators import gradient_of
-from stages.edges.stack import build_stack, noise_model, segment_curve
+from workbench_stages.edges.operators import gradient_of
+from workbench_stages.edges.stack import build_stack, noise_model, segment_curve
 
 EIGHT = np.ones((3, 3))
 

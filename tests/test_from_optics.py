@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from textures import KINDS, RIG, SIZE, pair, sharp, write_rig
 
-from stages.dfd.calibration import Calibration, pair_gain
-from stages.dfd.from_optics import OpticsParameters, from_optics, read_rig
-from stages.dfd.similarity import Similarity, align_pair
-from stages.dfd.texture import LARGEST_BLUR_PX, pair_noise, texture_curve
-from stages.optics.rig import Rig
 from workbench.pipeline import Pipeline, Run
 from workbench.plugins import find_stages
 from workbench.recording import Camera, Frame
 from workbench.settings import resolve
+from workbench_stages.dfd.calibration import Calibration, pair_gain
+from workbench_stages.dfd.from_optics import OpticsParameters, from_optics, read_rig
+from workbench_stages.dfd.similarity import Similarity, align_pair
+from workbench_stages.dfd.texture import LARGEST_BLUR_PX, pair_noise, texture_curve
+from workbench_stages.optics.rig import Rig
 
 WHOLE = (SIZE, SIZE)
 INNER = (slice(12, -12), slice(12, -12))

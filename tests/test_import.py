@@ -12,7 +12,6 @@ from mcap.reader import make_reader
 from PIL import Image
 from textures import pair, sharp, write_rig
 
-from stages.dfd.from_optics import read_rig
 from workbench.errors import DataError
 from workbench.importing import (
     Picture,
@@ -23,6 +22,7 @@ from workbench.importing import (
     read_picture,
 )
 from workbench.recording import Recording
+from workbench_stages.dfd.from_optics import read_rig
 
 Bench = Any
 

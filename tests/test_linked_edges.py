@@ -6,7 +6,7 @@ import pytest
 from edge_scenes import eight, scene
 from scipy import ndimage
 
-from stages.edges.linking import (
+from workbench_stages.edges.linking import (
     TERMINATOR_MASKS,
     Step,
     bresenham,
@@ -14,9 +14,9 @@ from stages.edges.linking import (
     reconstruct,
     terminators_of,
 )
-from stages.edges.planes import Camera
-from stages.edges.regions import region_features
-from stages.edges.segmentation import PRESETS, link_edges, segment, stack_edges
+from workbench_stages.edges.planes import Camera
+from workbench_stages.edges.regions import region_features
+from workbench_stages.edges.segmentation import PRESETS, link_edges, segment, stack_edges
 
 EIGHT = np.ones((3, 3))
 

@@ -9,13 +9,18 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.edges.planes import Camera
-from stages.edges.regions import region_features
-from stages.matching.database import Database, make_database, turn_profile, view_of
-from stages.matching.pose import outline_mm, pose_of
-from stages.matching.recognise import Reason, Rules, find_candidates, verdict_of
-from stages.matching.surfaces import camera_from_surface, cut_out, features_mm, shortest_turn
-from stages.region_features import as_rows
+from workbench_stages.edges.planes import Camera
+from workbench_stages.edges.regions import region_features
+from workbench_stages.matching.database import Database, make_database, turn_profile, view_of
+from workbench_stages.matching.pose import outline_mm, pose_of
+from workbench_stages.matching.recognise import Reason, Rules, find_candidates, verdict_of
+from workbench_stages.matching.surfaces import (
+    camera_from_surface,
+    cut_out,
+    features_mm,
+    shortest_turn,
+)
+from workbench_stages.region_features import as_rows
 
 CAMERA = Camera(1300.0, 1300.0, 127.5, 127.5)
 SIZE = 256

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from test_matching import CAMERA, ELL, RECTANGLE, Scene, normal_of, views_of
 
-from stages.matching.database import Database, make_database
-from stages.matching.scorers import PoseScorer, RecognitionScorer
-from stages.matching.surfaces import camera_from_surface
 from workbench.stage import Score
+from workbench_stages.matching.database import Database, make_database
+from workbench_stages.matching.scorers import PoseScorer, RecognitionScorer
+from workbench_stages.matching.surfaces import camera_from_surface
 
 RECORDED = SimpleNamespace(
     K=np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1.0]])

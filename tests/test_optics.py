@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from conftest import SCENE
 
-from stages.optics.analytic import (
+from workbench.recording import Recording
+from workbench_stages.optics.analytic import (
     disc_transfer,
     pattern_mean,
     pattern_value,
@@ -17,9 +18,8 @@ from stages.optics.analytic import (
     ratio,
     shading,
 )
-from stages.optics.rig import Pattern, Projector, Rig
-from stages.optics.thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
-from workbench.recording import Recording
+from workbench_stages.optics.rig import Pattern, Projector, Rig
+from workbench_stages.optics.thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
 
 
 def test_the_papers_numbers() -> None:

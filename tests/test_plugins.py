@@ -74,7 +74,7 @@ def test_files_of_the_same_name_in_two_folders_do_not_mix(tmp_path: Path) -> Non
 
 def test_a_stage_that_a_file_only_imports_is_not_its_own(plugin: Callable[[str], Path]) -> None:
     path = plugin(
-        "from stages.focus_maps import FocusMaps\n"
+        "from workbench_stages.focus_maps import FocusMaps\n"
         "class Other(FocusMaps):\n    name = 'other'\n    gives = (Artifact('o'),)\n"
     )
     found = find_stages([path])

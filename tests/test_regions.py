@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from edge_scenes import eight
 
-from stages.edges import score as metrics
-from stages.edges.planes import Camera, background_plane, fit_plane
-from stages.edges.regions import closed_regions, region_features
+from workbench_stages.edges import score as metrics
+from workbench_stages.edges.planes import Camera, background_plane, fit_plane
+from workbench_stages.edges.regions import closed_regions, region_features
 
 CAMERA = Camera(1300.0, 1300.0, 79.5, 79.5)
 

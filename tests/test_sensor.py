@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from thin_lens import Rig, frame, passes, planes
 
-from stages.dfd.calibration import Calibration
-from stages.dfd.depth import confidence_from_error
-from stages.dfd.focus import SensorNoise, focus_map, laplacian, noise_gain
-from stages.dfd.procedure import CalibrateParameters, calibrate
-from stages.dfd.similarity import (
+from workbench.pipeline import Pipeline, Run
+from workbench.plugins import find_stages
+from workbench.settings import resolve
+from workbench_stages.dfd.calibration import Calibration
+from workbench_stages.dfd.depth import confidence_from_error
+from workbench_stages.dfd.focus import SensorNoise, focus_map, laplacian, noise_gain
+from workbench_stages.dfd.procedure import CalibrateParameters, calibrate
+from workbench_stages.dfd.similarity import (
     Similarity,
     find_dots,
     fit_similarity,
@@ -21,10 +24,7 @@ from stages.dfd.similarity import (
     refine_similarity,
     warp_to_near,
 )
-from stages.dfd.stripes import average_over_period, measure_stripes, whole_period_taps
-from workbench.pipeline import Pipeline, Run
-from workbench.plugins import find_stages
-from workbench.settings import resolve
+from workbench_stages.dfd.stripes import average_over_period, measure_stripes, whole_period_taps
 
 RIGS = {
     "the paper's, pitch 50 µm": Rig(),

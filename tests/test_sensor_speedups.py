@@ -9,10 +9,16 @@ import numba
 import numpy as np
 import pytest
 
-from stages.dfd import cloud, depth, focus, similarity
-from stages.dfd.depth import Response, Windows, confidence_from_error, estimate, windows_for
-from stages.dfd.focus import SensorNoise, focus_map
-from stages.dfd.stripes import whole_period_taps
+from workbench_stages.dfd import cloud, depth, focus, similarity
+from workbench_stages.dfd.depth import (
+    Response,
+    Windows,
+    confidence_from_error,
+    estimate,
+    windows_for,
+)
+from workbench_stages.dfd.focus import SensorNoise, focus_map
+from workbench_stages.dfd.stripes import whole_period_taps
 
 SHAPES = [(1, 1), (1, 40), (40, 1), (2, 3), (16, 16), (57, 83), (90, 33)]
 NOISE = SensorNoise(0.3, 0.01)

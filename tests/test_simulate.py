@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from conftest import ROOT, SCENE, Command
 
-from stages.dfd.focus import focus_map
-from stages.dfd.stripes import whole_period_taps
-from stages.optics.analytic import plane_image, shading
-from stages.optics.rig import CHANNELS, Channel, Pattern, Projector, Rig
-from stages.simulation import render as tracer
-from stages.simulation.again import bodies_of
-from stages.simulation.bodies import Body, Mesh, load_mesh, square
-from stages.simulation.render import Lighting, render
-from stages.simulation.scene import FrameSpec, Scene, Table, stable_rotations
-from stages.simulation.sensor import Sensor
 from workbench.errors import DataError
 from workbench.recording import Recording
+from workbench_stages.dfd.focus import focus_map
+from workbench_stages.dfd.stripes import whole_period_taps
+from workbench_stages.optics.analytic import plane_image, shading
+from workbench_stages.optics.rig import CHANNELS, Channel, Pattern, Projector, Rig
+from workbench_stages.simulation import render as tracer
+from workbench_stages.simulation.again import bodies_of
+from workbench_stages.simulation.bodies import Body, Mesh, load_mesh, square
+from workbench_stages.simulation.render import Lighting, render
+from workbench_stages.simulation.scene import FrameSpec, Scene, Table, stable_rotations
+from workbench_stages.simulation.sensor import Sensor
 
 PARTS = ROOT / "recordings" / "parts"
 SCENES = ROOT / "recordings" / "scenes"

@@ -145,7 +145,8 @@ def test_workers_never_import_rerun() -> None:
         [
             sys.executable,
             "-c",
-            "import sys, workbench.sweep.worker, workbench.sweep.engines, stages.pictures; "
+            "import sys, workbench.sweep.worker, workbench.sweep.engines; "
+            "import workbench_stages.pictures; "
             "print([m for m in ('rerun', 'typer', 'pyarrow') if m in sys.modules])",
         ],
         capture_output=True,

@@ -245,10 +245,10 @@ def test_lessons_that_cannot_be_found_are_one_line(monkeypatch: pytest.MonkeyPat
     finding("no.such.module:LESSON")
     with pytest.raises(StageError, match=r"lesson e0 .* cannot be loaded"):
         find_lessons()
-    finding("stages.show:DARK")
+    finding("workbench_stages.show:DARK")
     with pytest.raises(StageError, match=r"expected a workbench.teach.Lesson"):
         find_lessons()
-    finding("stages.lessons.linking:LESSON", "stages.lessons.linking:LESSON")
+    finding("workbench_stages.lessons.linking:LESSON", "workbench_stages.lessons.linking:LESSON")
     with pytest.raises(StageError, match="both number 13"):
         find_lessons()
 

@@ -58,7 +58,7 @@ def train(output: Path, *flags: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_name_and_angles_come_from_the_truth_or_from_the_flags(tmp_path: Path) -> None:
-    from stages.matching.database import Database
+    from workbench_stages.matching.database import Database
 
     told, said = tmp_path / "told.npz", tmp_path / "said.npz"
     done = train(told, "--json")

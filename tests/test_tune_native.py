@@ -10,14 +10,14 @@ from conftest import Command
 from test_replay import vulkan_drivers
 
 import workbench
-from stages.linked_edges import LinkedEdges
-from stages.registration import Registration
 from workbench.stage import StageParameters, knob
 from workbench.tune.canvas import live_recording
 from workbench.tune.frames import SessionFrames
 from workbench.tune.live import LiveBench
 from workbench.tune.native import NativePanel, active_tab, indices, slider_of
 from workbench.viewer import native_viewer
+from workbench_stages.linked_edges import LinkedEdges
+from workbench_stages.registration import Registration
 
 
 class Odd(StageParameters):

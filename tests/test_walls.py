@@ -5,10 +5,10 @@ import pytest
 from edge_scenes import eight
 from scipy import ndimage
 
-from stages.edges.linking import Step
-from stages.edges.planes import Camera, fit_plane, fit_planes
-from stages.edges.regions import distance_to_border
-from stages.edges.segmentation import link_edges, segment, stack_edges
+from workbench_stages.edges.linking import Step
+from workbench_stages.edges.planes import Camera, fit_plane, fit_planes
+from workbench_stages.edges.regions import distance_to_border
+from workbench_stages.edges.segmentation import link_edges, segment, stack_edges
 
 CAMERA = Camera(900.0, 900.0, 99.5, 99.5)
 TABLE = 0.8

@@ -469,7 +469,7 @@ def test_laws_notice_a_story_that_lies(session: Session, runs: list[Run]) -> Non
 def test_a_rejected_edge_is_asked_about_itself_and_a_face_about_its_region(
     session: Session, runs: list[Run]
 ) -> None:
-    from stages.edges.linking import Step
+    from workbench_stages.edges.linking import Step
 
     rows, columns = np.nonzero(runs[0].artifacts["edge_step"] == Step.SHORT_HIGH)
     assert story(session.pipeline, runs[0], columns[0], rows[0]).subject == "linked_edges"

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stages.optics.analytic import disc_transfer
-from stages.optics.rig import Rig
+from workbench_stages.optics.analytic import disc_transfer
+from workbench_stages.optics.rig import Rig
 
 RIG = {
     "focal_length_mm": 50.0,

@@ -84,15 +84,17 @@ def open(
 ) -> Session:
     """A recording with its pipeline, as the command line would put it together.
 
-    ``set`` holds ``stage.parameter=value`` texts; ``frames`` is (first, one past the last, or
-    None for the end).  Iterate ``runs()`` of what is returned.  Raises ``RecordingError``,
-    ``StageError`` or ``SettingsError``, each with one line.
+    ``recording`` may be ``sample:scene``, which comes with the package.  ``set`` holds
+    ``stage.parameter=value`` texts; ``frames`` is (first, one past the last, or None for the end).
+    Iterate ``runs()`` of what is returned.  Raises ``RecordingError``, ``StageError`` or
+    ``SettingsError``, each with one line.
     """
+    from workbench.samples import located
     from workbench.session import Options, Session
 
     return Session.open(
         Options(
-            Path(recording),
+            located(recording),
             resources={
                 name: Path(path)
                 for name, path in (("calibration", calibration), ("models", models))

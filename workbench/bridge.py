@@ -6,7 +6,7 @@ defects, parameters with provenance, and the pipeline as a graph.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from typing import Any
 
@@ -88,13 +88,16 @@ class Bridge:
         broken = {failure.stage: failure.says for failure in run.failures}
         for stage in self.session.pipeline.stages:
             with self._replacing(stage.name) as kept:
-                if stage.name in broken:
+                failure = run.failure_of(stage.name)
+                if failure is not None and not failure.gave:
                     continue
                 try:
                     stage.log(kept, self._logged(run, stage.name))
                 except Exception as error:
-                    broken[stage.name] = f"its pictures: {one_line(error)}"
-                    report.fail(stage.name, broken[stage.name])
+                    # Pictures of what a failed stage did not give: that is told already.
+                    if failure is None:
+                        broken[stage.name] = f"its pictures: {one_line(error)}"
+                        report.fail(stage.name, broken[stage.name])
         for name, milliseconds in run.stage_ms.items():
             recording.log(f"bench/times/{name}", rr.Scalars(milliseconds))
         for name, value in scores.items():
@@ -107,14 +110,15 @@ class Bridge:
             self._named_scores.add(name)
             series = rr.SeriesLines(names=name.split("/")[-1])
             recording.log(f"bench/scores/{name}", series, static=True)
-        shown = {stage.name for stage in self.session.pipeline.stages} - set(broken)
+        silent = set(broken) - {failure.stage for failure in run.failures if failure.gave}
+        shown = {stage.name for stage in self.session.pipeline.stages} - silent
         shown |= {f"recorded {channel}" for channel in frame.images} | {"bench"}
         shown |= ({"scores"} if scores else set()) | ({"truth"} if frame.truth else set())
         if not self._laid_out >= shown:
             # The first frame, or the first on which something came that was not there before.
             self._laid_out |= shown
             scored = "scores" in self._laid_out
-            recording.send_blueprint(self.blueprint(run, scored, broken, report))
+            recording.send_blueprint(self.blueprint(run, scored, silent, report))
 
     @contextmanager
     def _replacing(self, owner: str) -> Iterator[_PathKeeper]:
@@ -253,20 +257,21 @@ class Bridge:
     # -- the layout -------------------------------------------------------------------------------
 
     def blueprint(
-        self, run: Run, scored: bool, broken: Mapping[str, str], report: RunReport
+        self, run: Run, scored: bool, silent: Set[str], report: RunReport
     ) -> rrb.Blueprint:
         """All at a glance first, then a tab for each chapter of the pipeline and one for the bench.
 
         At a glance there is a row for each chapter, read from left to right, and a shelf below.
-        Stages in ``broken`` have nothing to show; their errors are among the defects.
+        Stages in ``silent`` have nothing to show; their errors are among the defects.
         """
-        shown = [stage for stage in self.session.pipeline.stages if stage.name not in broken]
+        shown = [stage for stage in self.session.pipeline.stages if stage.name not in silent]
         for stage in list(shown):
             try:
                 stage.views(self._logged(run, stage.name))
             except Exception as error:
-                report.fail(stage.name, f"its views: {one_line(error)}")
                 shown.remove(stage)
+                if run.failure_of(stage.name) is None:
+                    report.fail(stage.name, f"its views: {one_line(error)}")
         rows = self._rows(run, shown)
         chapters = [_row(row, name) for name, row in rows.items()]
         glance = rrb.Vertical(

@@ -20,6 +20,7 @@ from workbench.errors import (
     UsageError,
     one_line,
 )
+from workbench.samples import located
 
 app = typer.Typer(
     name="workbench",
@@ -31,7 +32,14 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-Rec = Annotated[Path, typer.Argument(help="The recording, an MCAP file.", metavar="REC")]
+Rec = Annotated[
+    Path,
+    typer.Argument(
+        help="The recording, an MCAP file; sample:scene is one that comes with the package.",
+        metavar="REC",
+        parser=located,
+    ),
+]
 Calibration = Annotated[
     Path | None,
     typer.Option(help="Calibration file; the one beside the recording if not given."),
@@ -275,6 +283,7 @@ def compare(
         typer.Argument(
             help="A recording, to run under both configurations; or two saved replays (.rrd).",
             metavar="REC | A.rrd B.rrd",
+            parser=located,
         ),
     ],
     a: Annotated[
@@ -477,7 +486,9 @@ def import_(
 def train(
     recordings: Annotated[
         list[Path],
-        typer.Argument(help="Recordings, each of one part lying flat.", metavar="REC…"),
+        typer.Argument(
+            help="Recordings, each of one part lying flat.", metavar="REC…", parser=located
+        ),
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="The file to write.")],
     calibration: Calibration = None,
@@ -579,7 +590,8 @@ def simulate(
 @app.command()
 def sweep(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings, MCAP files.", metavar="REC…")
+        list[Path],
+        typer.Argument(help="Recordings, MCAP files.", metavar="REC…", parser=located),
     ],
     axis: Annotated[
         list[str] | None,

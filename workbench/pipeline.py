@@ -43,6 +43,8 @@ class Failure:
     says: str
     blocked_by: str | None = None
     """The stage whose failure left this one without its inputs; None if it failed itself."""
+    gave: tuple[str, ...] = ()
+    """The artifacts that it had given before it failed, which stand."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,10 @@ class Run:
     computed: frozenset[str]
     """The stages that really ran; the others' results were kept from before."""
 
+    def failure_of(self, stage: str) -> Failure | None:
+        """How the stage failed on this frame, or None."""
+        return next((failure for failure in self.failures if failure.stage == stage), None)
+
 
 @dataclass(frozen=True)
 class _Result:
@@ -66,6 +72,8 @@ class _Result:
     warnings: tuple[str, ...]
     milliseconds: float
     size: int
+    failure: str | None = None
+    """Why the stage did not give the rest of what it declares."""
 
 
 @dataclass
@@ -209,7 +217,8 @@ class Pipeline:
             if failure is not None:
                 failures.append(failure)
                 culprit = failure.blocked_by or stage.name
-                failed_givers.update((a.name, culprit) for a in stage.gives)
+                lost = (a.name for a in stage.gives if a.name not in artifacts)
+                failed_givers.update((name, culprit) for name in lost)
             yield so_far()
 
     def _step(
@@ -238,12 +247,15 @@ class Pipeline:
                 result = self._compute(stage, inputs, parameters)
             except Exception as error:
                 return Failure(stage.name, one_line(error))
-            self.store.put(key, result)
+            if result.failure is None:
+                self.store.put(key, result)
             computed.add(stage.name)
         artifacts.update(result.outputs)
-        digests.update((a.name, f"{key} {a.name}") for a in stage.gives)
+        digests.update((name, f"{key} {name}") for name in result.outputs)
         warnings += [f"{stage.name}: {says}" for says in result.warnings]
         stage_ms[stage.name] = result.milliseconds
+        if result.failure is not None:
+            return Failure(stage.name, result.failure, gave=tuple(result.outputs))
         return None
 
     def _sources_of(self, frame: Frame) -> tuple[dict[str, Any], dict[str, str]]:
@@ -281,26 +293,58 @@ class Pipeline:
             if stage.name not in self._warm:
                 # The first call of a stage pays for imports and compilation, which would be
                 # told as its time on the first frame; the timed call is the second.
-                stage.compute(inputs, parameters)
+                _outputs_of(stage, inputs, parameters)
                 self._warm.add(stage.name)
                 caught.clear()
             start = time.perf_counter()
-            outputs = dict(stage.compute(inputs, parameters))
+            outputs, failure = _outputs_of(stage, inputs, parameters)
             milliseconds = (time.perf_counter() - start) * 1e3
         says = [*outputs.pop(WARNINGS, ()), *(str(w.message) for w in caught)]
         expected = {artifact.name for artifact in stage.gives}
-        if set(outputs) != expected:
+        if set(outputs) - expected or (failure is None and set(outputs) != expected):
             raise StageError(f"gave {sorted(outputs)} where it declares {sorted(expected)}")
         sizes: dict[str, int] = {}
         seen: set[int] = set()
         size = 0
         for artifact in stage.gives:
+            if artifact.name not in outputs:
+                continue
             value = outputs[artifact.name]
-            artifact.check(value, sizes)
+            try:
+                artifact.check(value, sizes)
+            except StageError as error:
+                # One result that is not what was declared does not take the others with it.
+                del outputs[artifact.name]
+                failure = failure or str(error)
+                continue
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
             size += _bytes_of(value, seen)
-        return _Result(MappingProxyType(outputs), tuple(says), milliseconds, size)
+        if not outputs and failure is not None:
+            raise StageError(failure)
+        return _Result(MappingProxyType(outputs), tuple(says), milliseconds, size, failure)
+
+
+def _outputs_of(
+    stage: Stage, inputs: Mapping[str, Any], parameters: Any
+) -> tuple[dict[str, Any], str | None]:
+    """All that a stage gives, at once or in parts, and why the parts ended early, or None.
+
+    Raises what the stage raises before it has given anything.
+    """
+    given = stage.compute(inputs, parameters)
+    outputs: dict[str, Any] = {}
+    warnings: list[str] = []
+    failure = None
+    try:
+        for part in [given] if isinstance(given, Mapping) else given:
+            outputs.update(part)
+            warnings += outputs.pop(WARNINGS, ())
+    except Exception as error:
+        if not outputs:
+            raise
+        failure = one_line(error)
+    return {**outputs, WARNINGS: warnings}, failure
 
 
 def ordered(stages: Mapping[str, Stage], until: str | None = None) -> list[Stage]:

@@ -52,20 +52,22 @@ class RunReport:
             else:
                 times[self.frames % _KEPT_TIMES] = ms
             self.worst_ms[stage] = max(self.worst_ms.get(stage, 0.0), ms)
-        for failure in run.failures:
-            self._count(self.failures, (failure.stage, failure.says))
+        for one in run.failures:
+            self._count(self.failures, (one.stage, one.says))
         for says in run.warnings:
             self._count(self.warnings, says)
         scores: dict[str, float] = {}
-        failed = {failure.stage for failure in run.failures}
         if run.frame.truth is not None:
             for name, scorer in self.scorers.items():
-                if name in failed:
+                failure = run.failure_of(name)
+                if failure is not None and not failure.gave:
                     continue
                 try:
                     own = scorer.add(run.frame.truth, run.artifacts)
                 except Exception as error:
-                    self.fail(name, f"scoring: {one_line(error)}")
+                    # What a failed stage did not give cannot be scored: that is told already.
+                    if failure is None:
+                        self.fail(name, f"scoring: {one_line(error)}")
                     continue
                 scores.update({f"{name}/{key}": value for key, value in own.items()})
         return scores

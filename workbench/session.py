@@ -14,14 +14,14 @@ from typing import Any
 
 from workbench import interrupts
 from workbench.errors import DataError, UsageError
+from workbench.extras import DISTRIBUTION
 from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.plugins import find_stages
 from workbench.recording import Recording
 from workbench.settings import resolve
 from workbench.stage import RecordedImage, Resource, Stage
 
-DISTRIBUTION = "defocus-workbench"
-_IDENTIFIED_LIBRARIES = ("numpy", "opencv-python-headless", "numba", "open3d", "rerun-sdk")
+_IDENTIFIED_LIBRARIES = ("numpy", "opencv-python-headless", "numba", "rerun-sdk")
 
 
 @dataclass(frozen=True)

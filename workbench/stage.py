@@ -17,7 +17,7 @@ Frames and signs, stated once for the whole bench
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args, get_origin
@@ -32,7 +32,11 @@ Inputs = Mapping[str, Any]
 """What a stage's ``compute`` receives: artifact name to value; an absent optional one is None."""
 
 Outputs = dict[str, Any]
-"""What it returns: every artifact it declares, and optionally :data:`WARNINGS`."""
+"""What it returns: every artifact it declares, and optionally :data:`WARNINGS`.
+
+A stage may also yield its outputs in parts.  Where it then raises, the parts that it had given
+stand, and only the rest is missing: yield first what the other stages can do without the rest of.
+"""
 
 WARNINGS = "warnings"
 """Reserved key of :data:`Outputs`: a sequence of sentences about this frame."""
@@ -351,8 +355,11 @@ class Stage:
     published_time: ClassVar[str] = ""
     """What the publication that the stage implements says of its time; empty if nothing."""
 
-    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        """Outputs from inputs and parameters.  An exception is caught, shown and counted."""
+    def compute(self, inputs: Inputs, parameters: Any) -> Outputs | Iterator[Outputs]:
+        """Outputs from inputs and parameters, at once or in parts.
+
+        An exception is caught, shown and counted; parts that were given before it are kept.
+        """
         raise NotImplementedError
 
     def log(self, recording: Any, logged: Logged) -> None:

@@ -133,16 +133,18 @@ def story(pipeline: Pipeline, run: Run, x: int, y: int) -> Story:
 
 def tell(pipeline: Pipeline, run: Run, stage: Stage, x: int, y: int) -> StageStory:
     """What one stage tells of pixel (x, y); whatever goes wrong is in ``trouble``."""
-    failure = next((f for f in run.failures if f.stage == stage.name), None)
-    if failure is not None:
-        return StageStory(stage.name, trouble=failure.says)
+    failure = run.failure_of(stage.name)
+    trouble = None if failure is None else failure.says
+    if failure is not None and not failure.gave:
+        return StageStory(stage.name, trouble=trouble)
     parameters = pipeline.settings.parameters[stage.name]
     try:
         findings = tuple(stage.explain(x, y, run.artifacts, parameters))
         thresholds = tuple(_threshold(stage, parameters, f.parameter) for f in findings)
     except Exception as error:
-        return StageStory(stage.name, trouble=f"its explanation failed: {one_line(error)}")
-    return StageStory(stage.name, findings, None, thresholds)
+        says = f"its explanation failed: {one_line(error)}"
+        return StageStory(stage.name, trouble=trouble or says)
+    return StageStory(stage.name, findings, trouble, thresholds)
 
 
 def _threshold(stage: Stage, parameters: Any, name: str | None) -> Threshold | None:

@@ -15,12 +15,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from stages.arrays import read_arrays
-from stages.dfd.focus import LaplacianKind, SensorNoise
-from stages.dfd.similarity import Similarity
-from stages.dfd.stripes import Stripes
-from stages.dfd.texture import Texture
 from workbench.files import replacing
+
+from ..arrays import read_arrays
+from .focus import LaplacianKind, SensorNoise
+from .similarity import Similarity
+from .stripes import Stripes
+from .texture import Texture
 
 _GAIN_CELLS = 16
 _GAIN_ROUNDS = 5

@@ -19,13 +19,11 @@ def cloud_from_depth(
     """Points [N 3] in metres, unit normals [N 3] and grey levels [N] of all known pixels.
 
     ``depth_m`` [H W] has NaN where unknown; ``camera`` has ``width``, ``height`` and ``K``.  The
-    points are made by Open3D, in row order.  The normals are those of the least-squares plane
+    points come in row order.  The normals are those of the least-squares plane
     through the known pixels within ``reach_px``, fitted to 1/z over the image, where a plane in
     space is exactly linear; they point to the camera.  A pixel with too few known neighbours
     gets the direction to the camera.  Raises ``ValueError`` if the camera is of another size.
     """
-    import open3d as o3d
-
     height, width = depth_m.shape
     if (camera.width, camera.height) != (width, height):
         raise ValueError(
@@ -35,13 +33,9 @@ def cloud_from_depth(
     known = np.isfinite(depth_m) & (depth_m > 0)
     filled = np.where(known, depth_m, np.float32(0))
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
-    cloud = o3d.geometry.PointCloud.create_from_depth_image(
-        o3d.geometry.Image(np.ascontiguousarray(filled)),  # type: ignore[call-overload]
-        o3d.camera.PinholeCameraIntrinsic(width, height, fx, fy, cx, cy),
-        depth_scale=1.0,
-        depth_trunc=float("inf"),
-    )
-    points = np.asarray(cloud.points).astype(np.float32)
+    y, x = np.nonzero(known)
+    z = depth_m[known].astype(np.float64)
+    points = np.stack([(x - cx) * z / fx, (y - cy) * z / fy, z], axis=1).astype(np.float32)
     centre = (np.float32(fx), np.float32(fy), np.float32(cx), np.float32(cy))
     normals = _plane_normals(filled, known, len(points), *centre, max(1, reach_px))
     return points, normals, intensity[known].astype(np.float32, copy=False)

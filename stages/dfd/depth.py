@@ -37,7 +37,7 @@ import cv2
 import numba
 import numpy as np
 
-from stages.dfd.focus import LaplacianKind, SensorNoise, mirror_ends, mirrored, noise_gain
+from .focus import LaplacianKind, SensorNoise, mirror_ends, mirrored, noise_gain
 
 NOMINAL_CURVE = np.array([0.5, -0.5], np.float32).reshape(2, 1, 1)
 """Relative depth from Q where there is no calibration: t = (1 - Q) / 2."""

@@ -75,7 +75,7 @@ def focus_map(
 ) -> np.ndarray:
     """Root mean square Laplacian response of ``image`` [H W] over a window, float32 [H W].
 
-    ``x_taps`` and ``y_taps`` are the window (:func:`stages.dfd.stripes.whole_period_taps`).  The
+    ``x_taps`` and ``y_taps`` are the window (:func:`dfd.stripes.whole_period_taps`).  The
     energy that ``noise`` explains is subtracted before the root; what falls below it is 0.
     """
     values = image.astype(np.float32, copy=False)

@@ -1,7 +1,7 @@
 """``workbench calibrate --from-optics``: a calibration from the lens's data alone.
 
 For pictures that come with focal length, f-number, pixel pitch and two focus distances, and with
-no planes of known distance.  What is assumed is in :mod:`stages.dfd.texture` and in the report.
+no planes of known distance.  What is assumed is in :mod:`dfd.texture` and in the report.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from stages.dfd.calibration import Calibration
-from stages.dfd.focus import LaplacianKind, SensorNoise
-from stages.dfd.similarity import Similarity
-from stages.dfd.texture import texture_curve
-from stages.optics.rig import CHANNELS, Rig
-from stages.optics.thin_lens import object_distance_mm
 from workbench.stage import StageParameters, knob
+
+from ..optics.rig import CHANNELS, Rig
+from ..optics.thin_lens import object_distance_mm
+from .calibration import Calibration
+from .focus import LaplacianKind, SensorNoise
+from .similarity import Similarity
+from .texture import texture_curve
 
 SMALLEST_BLUR_PX = 0.7
 """Blur circle at the other focal plane under which there is no difference of sharpness to see."""
@@ -55,7 +56,7 @@ class OpticsParameters(StageParameters):
 def read_rig(path: Path, size: tuple[int, int] | None = None) -> Rig:
     """The rig in a TOML file, for pictures of ``size`` = (width, height).
 
-    The keys are those of :class:`stages.optics.rig.Rig`, of which nothing optical may be left out
+    The keys are those of :class:`optics.rig.Rig`, of which nothing optical may be left out
     here: a default would be a guess about somebody's lens.  The focal planes are given by
     ``near_focus_mm`` and ``far_focus_mm`` (inf is allowed) or ``sensor_separation_mm``, or by the
     sensor's distances behind the lens, ``near_sensor_mm`` and ``far_sensor_mm``; the pixels by

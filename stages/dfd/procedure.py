@@ -18,13 +18,16 @@ import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from stages.dfd.calibration import Calibration, gain_terms, light_ratio
-from stages.dfd.depth import windows_for
-from stages.dfd.focus import LaplacianKind, SensorNoise, focus_map
-from stages.dfd.from_optics import OpticsParameters, from_optics, read_rig, rig_record
-from stages.dfd.images import full_scale, grey
-from stages.dfd.score import PATCH_PX
-from stages.dfd.similarity import (
+from workbench.stage import StageParameters, knob
+
+from ..optics.rig import Rig
+from .calibration import Calibration, gain_terms, light_ratio
+from .depth import windows_for
+from .focus import LaplacianKind, SensorNoise, focus_map
+from .from_optics import OpticsParameters, from_optics, read_rig, rig_record
+from .images import full_scale, grey
+from .score import PATCH_PX
+from .similarity import (
     Similarity,
     find_dots,
     fit_similarity,
@@ -33,9 +36,7 @@ from stages.dfd.similarity import (
     refine_similarity,
     warp_to_near,
 )
-from stages.dfd.stripes import Stripes, measure_stripes, whole_period_taps
-from stages.optics.rig import Rig
-from workbench.stage import StageParameters, knob
+from .stripes import Stripes, measure_stripes, whole_period_taps
 
 _MIN_DOTS = 16
 _ALIGNING_PAIRS = 8

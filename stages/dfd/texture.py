@@ -30,9 +30,9 @@ import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from stages.dfd.focus import LaplacianKind, SensorNoise, laplacian
-from stages.dfd.stripes import whole_period_taps
-from stages.optics.analytic import disc_transfer
+from ..optics.analytic import disc_transfer
+from .focus import LaplacianKind, SensorNoise, laplacian
+from .stripes import whole_period_taps
 
 LARGEST_BLUR_PX = 4.5
 """Blur circle at the other focal plane, in pixels of the scale at which focus is measured, beyond

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.stack import image_scale
+from .stack import image_scale
 
 __all__ = ["RIDGE_REACH", "DepthEdges", "depth_edges"]
 

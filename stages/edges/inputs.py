@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.edges.planes import Camera
+from .planes import Camera
 
 
 def best_depth(inputs: Mapping[str, Any]) -> tuple[np.ndarray | None, Camera | None]:

@@ -31,7 +31,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.stack import image_scale
+from .stack import image_scale
 
 __all__ = [
     "TERMINATOR_MASKS",
@@ -85,7 +85,7 @@ class Step(IntEnum):
     """Drawn to close a region where depth shows a step or a crease.  Value: its evidence."""
     FOOT = 31
     """The foot of an upright wall, drawn because depth shows the face above the wall lying over
-    the table, see :mod:`stages.edges.walls`.  Value: that face's height over the table, metres."""
+    the table, see :mod:`edges.walls`.  Value: that face's height over the table, metres."""
 
 
 # -- reconstruction ------------------------------------------------------------------------------

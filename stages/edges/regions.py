@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.operators import Gradient
-from stages.edges.planes import Camera, background_plane, fit_planes
-from stages.edges.stack import image_scale
+from .operators import Gradient
+from .planes import Camera, background_plane, fit_planes
+from .stack import image_scale
 
 __all__ = [
     "RegionTable", "closed_regions", "closed_share", "distance_to_border", "region_features",
@@ -197,7 +197,7 @@ def closed_regions(
             leaves those without a region.
         gradient: of the image; where it has a maximum, it tells to a fraction of a pixel on which
             side of the edge a pixel lies, better than the grey level does.
-        walls: [H W] int32, regions that are known already (:mod:`stages.edges.walls`), 0
+        walls: [H W] int32, regions that are known already (:mod:`edges.walls`), 0
             elsewhere; edges within them count for nothing.
         min_area: smaller regions are none (the inside of a double line), and are shared out as
             edge pixels are; pixels at 256².

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from stages.edges.score import (
+from workbench.stage import Score, Scorer
+
+from .score import (
     EdgeScore,
     FaceScore,
     edge_score,
@@ -17,7 +19,6 @@ from stages.edges.score import (
     region_score,
     summarise,
 )
-from workbench.stage import Score, Scorer
 
 TOLERANCE_PX = 2
 MIN_FACE_PX = 150

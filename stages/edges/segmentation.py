@@ -17,14 +17,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.depth_edges import RIDGE_REACH, DepthEdges, depth_edges
-from stages.edges.linking import Linked, Links, Reconstruction, Step, link, path_offset, reconstruct
-from stages.edges.operators import Gradient, gradient_of, non_maximum_suppression
-from stages.edges.planes import Camera
-from stages.edges.presets import PRESETS
-from stages.edges.regions import closed_regions, distance_to_border
-from stages.edges.stack import EdgeStack, build_stack, image_scale, noise_model
-from stages.edges.walls import Walls, upright_walls
+from .depth_edges import RIDGE_REACH, DepthEdges, depth_edges
+from .linking import Linked, Links, Reconstruction, Step, link, path_offset, reconstruct
+from .operators import Gradient, gradient_of, non_maximum_suppression
+from .planes import Camera
+from .presets import PRESETS
+from .regions import closed_regions, distance_to_border
+from .stack import EdgeStack, build_stack, image_scale, noise_model
+from .walls import Walls, upright_walls
 
 __all__ = ["PRESETS", "LinkedResult", "StackResult", "link_edges", "segment", "stack_edges"]
 
@@ -90,12 +90,12 @@ def stack_edges(
 
     Args:
         image: [H W] intensity without stripes; depth: [H W], any unit, NaN where unknown, or None.
-        operator, full_scale: see :func:`stages.edges.operators.gradient_of`.
+        operator, full_scale: see :func:`edges.operators.gradient_of`.
         noise_units: thresholds in standard deviations of the gradient's noise at the pixel's
             grey level, else in grey levels of 8 bit.
         lowest: where the search for the low threshold starts, in that unit.
         greatest: the greatest high threshold, in that unit; None takes the operator's.
-        max_ratio, steps, small_segment: see :func:`stages.edges.stack.build_stack`.
+        max_ratio, steps, small_segment: see :func:`edges.stack.build_stack`.
         use_depth: let the depth take part where it is given.
         depth_gain: the joint gradient is the intensity's times ``1 + depth_gain · e``, where e
             rises from 0 to 1 with the depth's evidence for a step or a crease and is 1 from
@@ -230,9 +230,9 @@ def link_edges(
     ``crease_length`` pixels (both at 256²); then their ends are linked as other ends are.
     With the camera's intrinsics and a depth in metres, upright walls of ``wall_area`` pixels and
     more (at 256²) are found under the faces that lie above the table
-    (:mod:`stages.edges.walls`), and their feet drawn; 0 looks for none.
-    For the other parameters see :func:`stages.edges.linking.reconstruct` and
-    :func:`stages.edges.linking.link`.
+    (:mod:`edges.walls`), and their feet drawn; 0 looks for none.
+    For the other parameters see :func:`edges.linking.reconstruct` and
+    :func:`edges.linking.link`.
     """
     stack = given.stack
     done = reconstruct(

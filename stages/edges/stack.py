@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.operators import Gradient
+from .operators import Gradient
 
 __all__ = [
     "EdgeStack",

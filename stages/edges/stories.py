@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.edges.linking import Linked, Links, Step, bresenham
-from stages.edges.segmentation import LinkedResult, StackResult
-from stages.edges.stack import image_scale
-from stages.edges.walls import Walls
-from stages.wording import apart
+from ..wording import apart
+from .linking import Linked, Links, Step, bresenham
+from .segmentation import LinkedResult, StackResult
+from .stack import image_scale
+from .walls import Walls
 
 __all__ = ["Clause", "enclosed_px", "linking_story", "nearest_end", "on_line"]
 

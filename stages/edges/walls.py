@@ -22,8 +22,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from stages.edges.planes import Camera, background_plane, fit_planes
-from stages.edges.stack import image_scale
+from .planes import Camera, background_plane, fit_planes
+from .stack import image_scale
 
 __all__ = ["Walls", "upright_walls"]
 

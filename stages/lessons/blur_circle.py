@@ -56,7 +56,7 @@ class Lens(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.optics.rig import Rig
+        from ..optics.rig import Rig
 
         rig = Rig(f_number=parameters.f_number, near_focus_mm=parameters.near_focus_mm)
         circles = {
@@ -67,7 +67,7 @@ class Lens(Stage):
         return {"lesson_rig": rig, "blur_circles_um": circles}
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from .charts import (
             BOTH_COLOUR,
             FAR_COLOUR,
             NEAR_COLOUR,
@@ -105,7 +105,7 @@ class Lens(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import PAPER, chart_view
+        from .charts import PAPER, chart_view
 
         return [
             rrb.Vertical(
@@ -136,7 +136,8 @@ def _log_lens(recording: Any, path: str, rig: Any, u: float) -> None:
     """The whole lens: x along the axis, the object's side at a tenth of the image's."""
     import rerun as rr
 
-    from stages.lessons.charts import (
+    from ..optics.thin_lens import image_distance_mm
+    from .charts import (
         BOTH_COLOUR,
         FAINT,
         FAR_COLOUR,
@@ -144,7 +145,6 @@ def _log_lens(recording: Any, path: str, rig: Any, u: float) -> None:
         NEAR_COLOUR,
         log_texts,
     )
-    from stages.optics.thin_lens import image_distance_mm
 
     v = image_distance_mm(rig.focal_length_mm, u)
     half = rig.aperture_mm / 2
@@ -190,7 +190,8 @@ def _log_meeting(recording: Any, path: str, rig: Any, u: float, circles: dict[st
     """Around the sensors: 40 units a millimetre along the axis, 220 across."""
     import rerun as rr
 
-    from stages.lessons.charts import (
+    from ..optics.thin_lens import image_distance_mm
+    from .charts import (
         BOTH_COLOUR,
         FAINT,
         FAR_COLOUR,
@@ -198,7 +199,6 @@ def _log_meeting(recording: Any, path: str, rig: Any, u: float, circles: dict[st
         NEAR_COLOUR,
         log_texts,
     )
-    from stages.optics.thin_lens import image_distance_mm
 
     v = image_distance_mm(rig.focal_length_mm, u)
     middle = (rig.sensor_mm("near") + rig.sensor_mm("far")) / 2

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from stages.artifacts import MODELS
-from stages.lessons.scene import SCENE
 from workbench.pipeline import Run
 from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage, StageParameters, knob
 from workbench.teach import Claim, Lesson
+
+from ..artifacts import MODELS
+from .scene import SCENE
 
 TEXT = """
 Which way is the part turned? One could compare its picture with pictures of every turn, pixel by
@@ -63,7 +64,7 @@ class EigenspaceCurve(Stage):
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         from dataclasses import replace
 
-        from stages.matching.eigenspace import POINTS, match
+        from ..matching.eigenspace import POINTS, match
 
         database = inputs["models"]
         if database is None:
@@ -104,7 +105,8 @@ class EigenspaceCurve(Stage):
         import cv2
         import rerun as rr
 
-        from stages.lessons.charts import (
+        from ..matching.eigenspace import POINTS
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             FAR_COLOUR,
@@ -112,7 +114,6 @@ class EigenspaceCurve(Stage):
             INK,
             log_texts,
         )
-        from stages.matching.eigenspace import POINTS
 
         answer = logged.artifacts["lesson_answer"]
         space = answer["space"]
@@ -186,7 +187,7 @@ class EigenspaceCurve(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import PAPER, picture_view
+        from .charts import PAPER, picture_view
 
         shape = logged.artifacts["lesson_view"].shape
         return [

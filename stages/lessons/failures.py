@@ -6,7 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stages.artifacts import (
+from workbench.pipeline import Run
+from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage, StageParameters, knob
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import (
     CONFIDENCE,
     DEPTH,
     DRIFT,
@@ -15,12 +19,13 @@ from stages.artifacts import (
     FOCUS_NEAR,
     INTENSITY,
 )
-from stages.artifacts import FAR as FAR_REGISTERED
-from stages.artifacts import NEAR as NEAR_REGISTERED
-from stages.depth_cloud import DepthCloud
-from stages.focus_maps import FocusMaps
-from stages.lessons.scene import SCENE
-from stages.lessons.sensor import (
+from ..artifacts import FAR as FAR_REGISTERED
+from ..artifacts import NEAR as NEAR_REGISTERED
+from ..depth_cloud import DepthCloud
+from ..focus_maps import FocusMaps
+from ..registration import Registration
+from .scene import SCENE
+from .sensor import (
     CALIBRATION_GIVEN,
     FAR_GIVEN,
     NEAR_GIVEN,
@@ -32,10 +37,6 @@ from stages.lessons.sensor import (
     ratio_of,
     ratio_over_distance,
 )
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage, StageParameters, knob
-from workbench.teach import Claim, Lesson
 
 _SENSOR = (Optics, Plane, CalibrationPlanes, Registration, FocusMaps, DepthCloud)
 _MIDDLE = (slice(16, -16), slice(16, -16))
@@ -70,7 +71,8 @@ class ApertureAndStripe(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from ..show import grey_image
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             INK,
@@ -79,7 +81,6 @@ class ApertureAndStripe(Stage):
             log_chart,
             log_texts,
         )
-        from stages.show import grey_image
 
         artifacts = logged.artifacts
         rig, at, ratios = (
@@ -119,7 +120,7 @@ class ApertureAndStripe(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view, picture_view
+        from .charts import chart_view, picture_view
 
         shape = logged.artifacts["lesson_stripes"].shape
         return [
@@ -210,9 +211,9 @@ class WindowAndPeriod(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.dfd.focus import focus_map
-        from stages.dfd.images import grey
-        from stages.dfd.stripes import whole_period_taps
+        from ..dfd.focus import focus_map
+        from ..dfd.images import grey
+        from ..dfd.stripes import whole_period_taps
 
         calibration = inputs["calibration"]
         taps = whole_period_taps(parameters.window_px)
@@ -227,9 +228,9 @@ class WindowAndPeriod(Stage):
         return {"lesson_focus_near": near, "lesson_error_mm": error}
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import BAD_COLOUR, GOOD_COLOUR, INK, Axis, Curve, log_chart
-        from stages.lessons.charts import log_texts as texts
-        from stages.show import grey_image, log_map, log_signed_error
+        from ..show import grey_image, log_map, log_signed_error
+        from .charts import BAD_COLOUR, GOOD_COLOUR, INK, Axis, Curve, log_chart
+        from .charts import log_texts as texts
 
         artifacts = logged.artifacts
         error = artifacts["lesson_error_mm"]
@@ -265,8 +266,8 @@ class WindowAndPeriod(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view, picture_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import chart_view, picture_view
 
         shape = logged.artifacts["lesson_error_mm"].shape
         return [
@@ -370,7 +371,8 @@ class FoldPictures(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from ..show import log_map
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             GOOD_COLOUR,
@@ -382,7 +384,6 @@ class FoldPictures(Stage):
             log_texts,
             nice_ticks,
         )
-        from stages.show import log_map
 
         artifacts = logged.artifacts
         fold, depth = artifacts["lesson_fold"], artifacts["depth_m"]
@@ -432,8 +433,8 @@ class FoldPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import chart_view
 
         shape = logged.artifacts["depth_m"].shape
         return [
@@ -537,8 +538,8 @@ class DarkPictures(Stage):
         return {"lesson_halves": halves}
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import INK, log_texts
-        from stages.show import grey_image, log_map
+        from ..show import grey_image, log_map
+        from .charts import INK, log_texts
 
         artifacts = logged.artifacts
         halves = artifacts["lesson_halves"]
@@ -570,8 +571,8 @@ class DarkPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import picture_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import picture_view
 
         shape = logged.artifacts["depth_m"].shape
         return [
@@ -694,7 +695,7 @@ class Disturbance(Stage):
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
         import cv2
 
-        from stages.dfd.similarity import Similarity, warp_to_near
+        from ..dfd.similarity import Similarity, warp_to_near
 
         far = inputs["far_image"]
         height, width = far.shape
@@ -722,8 +723,8 @@ class PilePictures(Stage):
         return {}
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import INK, log_texts
-        from stages.show import log_map, log_signed_error, overlap
+        from ..show import log_map, log_signed_error, overlap
+        from .charts import INK, log_texts
 
         artifacts, truth = logged.artifacts, logged.truth
         near, far = artifacts["near"], artifacts["far"]
@@ -752,8 +753,8 @@ class PilePictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import picture_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import picture_view
 
         shape = logged.artifacts["depth_m"].shape
         return [

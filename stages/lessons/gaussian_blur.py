@@ -49,8 +49,8 @@ class LowPass(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.dfd.focus import focus_map, laplacian
-        from stages.dfd.stripes import whole_period_taps
+        from ..dfd.focus import focus_map, laplacian
+        from ..dfd.stripes import whole_period_taps
 
         d = parameters.blur_px
         x = np.arange(3 * _WIDTH_PX)
@@ -94,7 +94,8 @@ class LowPass(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from ..show import grey_image
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             FAR_COLOUR,
@@ -106,7 +107,6 @@ class LowPass(Stage):
             log_chart,
             log_texts,
         )
-        from stages.show import grey_image
 
         d = logged.parameters.blur_px
         numbers = logged.artifacts["lesson_numbers"]
@@ -151,7 +151,7 @@ class LowPass(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view, picture_view
+        from .charts import chart_view, picture_view
 
         shape = logged.artifacts["lesson_image"].shape
         return [
@@ -167,7 +167,7 @@ class LowPass(Stage):
 
 
 def _disc(diameter_px: float, frequency: np.ndarray) -> np.ndarray:
-    from stages.optics.analytic import disc_transfer
+    from ..optics.analytic import disc_transfer
 
     return disc_transfer(diameter_px * frequency)
 

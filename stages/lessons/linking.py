@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from stages.artifacts import (
+from workbench.pipeline import Run
+from workbench.stage import Inputs, Logged, Outputs, Stage
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import (
     DIRECTIONS,
     EDGE_STEP,
     EDGES_RECONSTRUCTED,
@@ -15,15 +19,12 @@ from stages.artifacts import (
     REGIONS,
     TERMINATORS,
 )
-from stages.edge_stack import EdgeStackStage
-from stages.edges.presets import PRESETS
-from stages.lessons.scene import SCENE, addressed
-from stages.linked_edges import LinkedEdges
-from stages.region_features import RegionFeatures
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Inputs, Logged, Outputs, Stage
-from workbench.teach import Claim, Lesson
+from ..edge_stack import EdgeStackStage
+from ..edges.presets import PRESETS
+from ..linked_edges import LinkedEdges
+from ..region_features import RegionFeatures
+from ..registration import Registration
+from .scene import SCENE, addressed
 
 TEXT = """
 A region can be measured only if its border is **closed**. Two steps close it.
@@ -74,8 +75,8 @@ class LinkPictures(Stage):
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr
 
-        from stages.lessons.charts import INK, log_texts
-        from stages.show import edge_image, grey_image, linked_image
+        from ..show import edge_image, grey_image, linked_image
+        from .charts import INK, log_texts
 
         artifacts = logged.artifacts
         ends = artifacts["terminators"]
@@ -109,7 +110,7 @@ class LinkPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import picture_view
+        from .charts import picture_view
 
         return [
             rrb.Horizontal(

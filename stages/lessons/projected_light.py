@@ -6,20 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from stages.artifacts import CONFIDENCE, DEPTH, FOCUS_FAR, FOCUS_NEAR
-from stages.depth_cloud import DepthCloud
-from stages.focus_maps import FocusMaps
-from stages.lessons.sensor import (
+from workbench.pipeline import Run
+from workbench.stage import Inputs, Logged, Outputs, Stage
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import CONFIDENCE, DEPTH, FOCUS_FAR, FOCUS_NEAR
+from ..depth_cloud import DepthCloud
+from ..focus_maps import FocusMaps
+from ..registration import Registration
+from .sensor import (
     FAR_GIVEN,
     NEAR_GIVEN,
     CalibrationPlanes,
     Optics,
     Plane,
 )
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Inputs, Logged, Outputs, Stage
-from workbench.teach import Claim, Lesson
 
 TEXT = """
 Blur can be measured only on something that can be blurred. A sheet of white paper looks the same in
@@ -50,8 +51,8 @@ class LightPictures(Stage):
         return {}
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import INK, log_texts
-        from stages.show import grey_image, log_map
+        from ..show import grey_image, log_map
+        from .charts import INK, log_texts
 
         artifacts = logged.artifacts
         for channel in ("near", "far"):
@@ -78,8 +79,8 @@ class LightPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import picture_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import picture_view
 
         shape = logged.artifacts["depth_m"].shape
         return [

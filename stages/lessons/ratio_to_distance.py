@@ -6,10 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from stages.artifacts import DEPTH, FOCUS_FAR, FOCUS_NEAR
-from stages.depth_cloud import DepthCloud
-from stages.focus_maps import FocusMaps
-from stages.lessons.sensor import (
+from workbench.pipeline import Run
+from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import DEPTH, FOCUS_FAR, FOCUS_NEAR
+from ..depth_cloud import DepthCloud
+from ..focus_maps import FocusMaps
+from ..registration import Registration
+from .sensor import (
     CALIBRATION_GIVEN,
     RIG,
     CalibrationPlanes,
@@ -18,10 +23,6 @@ from stages.lessons.sensor import (
     ratio_of,
     ratio_over_distance,
 )
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage
-from workbench.teach import Claim, Lesson
 
 TEXT = """
 The ratio Q of the two focus measures orders points by distance. *How far* they are it does not say:
@@ -72,7 +73,8 @@ class CurvePictures(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from ..show import log_map
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             FAR_COLOUR,
@@ -84,7 +86,6 @@ class CurvePictures(Stage):
             log_chart,
             nice_ticks,
         )
-        from stages.show import log_map
 
         artifacts = logged.artifacts
         curve = artifacts["lesson_curve"]
@@ -130,8 +131,8 @@ class CurvePictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import chart_view
 
         shape = logged.artifacts["depth_m"].shape
         return [

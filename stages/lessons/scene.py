@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-SCENE = Path(__file__).parents[2] / "recordings" / "scene.mcap"
-"""In a clone of the repository, from which the package is installed with ``pip install -e .``."""
+from workbench.samples import located
+
+SCENE = located("sample:scene")
 
 
 def addressed(by_stage: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """The bifocal sensor before a plane, for lessons: optics, one pair of images, a calibration.
 
-The images are the analytic ones of ``stages.optics``, with noise; what looks at them are the real
+The images are the analytic ones of ``optics``, with noise; what looks at them are the real
 stages.  :class:`Plane` and :class:`CalibrationPlanes` give artifacts that the stages otherwise take
 from a recording, and so must come before them in a lesson.
 """
@@ -14,7 +14,7 @@ import numpy as np
 
 from workbench.stage import Artifact, Inputs, Outputs, Stage, StageParameters, knob
 
-RIG = Artifact("rig", doc="the optics, a stages.optics.rig.Rig")
+RIG = Artifact("rig", doc="the optics, a optics.rig.Rig")
 NEAR_GIVEN = Artifact("near_image", "uint8", "H W", "grey levels", "near image")
 FAR_GIVEN = Artifact("far_image", "uint8", "H W", "grey levels", "far image")
 CALIBRATION_GIVEN = Artifact("calibration", doc="both steps of section 3.2")
@@ -69,7 +69,7 @@ class Optics(Stage):
         )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.optics.rig import Projector, Rig
+        from ..optics.rig import Projector, Rig
 
         rig = Rig(
             f_number=parameters.f_number,
@@ -143,7 +143,7 @@ class CalibrationPlanes(Stage):
         planes: int = knob(15, "How many known distances are shown to it.", low=6, high=31, step=1)
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.dfd.procedure import CalibrateParameters, calibrate
+        from ..dfd.procedure import CalibrateParameters, calibrate
 
         # Calibrated where it was well aligned: a later shift is what a lesson is about.
         rig = inputs["rig"].model_copy(
@@ -165,7 +165,7 @@ def plane_light(
 
     ``pattern`` and ``texture`` are contrasts; the texture is the same for every plane.
     """
-    from stages.optics.analytic import disc_transfer, plane_image
+    from ..optics.analytic import disc_transfer, plane_image
 
     if channel == "far" and rig.far_shift_px != (0.0, 0.0):
         # A sensor that is shifted sees what the pinhole's centre, shifted with it, sees.
@@ -203,8 +203,8 @@ def ratio_over_distance(rig: Any, distances_mm: np.ndarray, albedo: float = 0.55
 
     Noise-free, by the real focus measure over whole stripe periods.
     """
-    from stages.dfd.focus import focus_map
-    from stages.dfd.stripes import whole_period_taps
+    from ..dfd.focus import focus_map
+    from ..dfd.stripes import whole_period_taps
 
     taps = whole_period_taps(float(rig.period_px("near")))
     middle = slice(SIZE_PX // 4, -SIZE_PX // 4)

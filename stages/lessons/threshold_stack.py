@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from stages.artifacts import (
+from workbench.pipeline import Run
+from workbench.stage import Inputs, Logged, Outputs, Stage
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import (
     EDGE_CHOICE,
     EDGES_HIGH,
     EDGES_LOW,
@@ -12,13 +16,10 @@ from stages.artifacts import (
     GRADIENT,
     INTENSITY,
 )
-from stages.edge_stack import EdgeStackStage
-from stages.edges.presets import PRESETS
-from stages.lessons.scene import SCENE, addressed
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Inputs, Logged, Outputs, Stage
-from workbench.teach import Claim, Lesson
+from ..edge_stack import EdgeStackStage
+from ..edges.presets import PRESETS
+from ..registration import Registration
+from .scene import SCENE, addressed
 
 TEXT = """
 An edge operator gives a *gradient*; an edge image needs a *threshold*. Too high, and faint creases
@@ -67,7 +68,8 @@ class StackPictures(Stage):
         import numpy as np
         import rerun as rr
 
-        from stages.lessons.charts import (
+        from ..show import grey_image
+        from .charts import (
             BAD_COLOUR,
             BOTH_COLOUR,
             GOOD_COLOUR,
@@ -79,7 +81,6 @@ class StackPictures(Stage):
             log_texts,
             nice_ticks,
         )
-        from stages.show import grey_image
 
         artifacts = logged.artifacts
         stack = artifacts["edge_choice"].stack
@@ -124,7 +125,7 @@ class StackPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view, picture_view
+        from .charts import chart_view, picture_view
 
         return [
             rrb.Vertical(

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from stages.lessons.sensor import FAR_GIVEN, NEAR_GIVEN, RIG, Optics, Plane, ratio_over_distance
 from workbench.stage import Artifact, Inputs, Logged, Outputs, Stage
 from workbench.teach import Claim, Lesson
+
+from .sensor import FAR_GIVEN, NEAR_GIVEN, RIG, Optics, Plane, ratio_over_distance
 
 TEXT = """
 If blur tells distance, why two images? Look at the near sensor alone (red curve). Its focus measure
@@ -41,8 +42,8 @@ class TwoImages(Stage):
     )
 
     def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
-        from stages.dfd.focus import focus_map
-        from stages.dfd.stripes import whole_period_taps
+        from ..dfd.focus import focus_map
+        from ..dfd.stripes import whole_period_taps
 
         rig = inputs["rig"]
         taps = whole_period_taps(rig.period_px("near"))
@@ -56,7 +57,8 @@ class TwoImages(Stage):
         }
 
     def log(self, recording: Any, logged: Logged) -> None:
-        from stages.lessons.charts import (
+        from ..show import grey_image
+        from .charts import (
             BOTH_COLOUR,
             FAR_COLOUR,
             GOOD_COLOUR,
@@ -68,7 +70,6 @@ class TwoImages(Stage):
             log_chart,
             nice_ticks,
         )
-        from stages.show import grey_image
 
         artifacts = logged.artifacts
         focus, curves, at = artifacts["lesson_focus"], artifacts["lesson_curves"], _distances()
@@ -108,7 +109,7 @@ class TwoImages(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import chart_view, picture_view
+        from .charts import chart_view, picture_view
 
         return [
             rrb.Horizontal(

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from stages.artifacts import (
+from workbench.pipeline import Run
+from workbench.stage import Inputs, Logged, Outputs, Stage
+from workbench.teach import Claim, Lesson
+
+from ..artifacts import (
     CALIBRATION,
     CANDIDATES,
     DEPTH,
@@ -17,18 +21,15 @@ from stages.artifacts import (
     REGIONS,
     VERDICT,
 )
-from stages.depth_cloud import DepthCloud
-from stages.edge_stack import EdgeStackStage
-from stages.focus_maps import FocusMaps
-from stages.lessons.scene import SCENE
-from stages.linked_edges import LinkedEdges
-from stages.pose_frames import PoseFrames
-from stages.recognition import Recognition
-from stages.region_features import RegionFeatures
-from stages.registration import Registration
-from workbench.pipeline import Run
-from workbench.stage import Inputs, Logged, Outputs, Stage
-from workbench.teach import Claim, Lesson
+from ..depth_cloud import DepthCloud
+from ..edge_stack import EdgeStackStage
+from ..focus_maps import FocusMaps
+from ..linked_edges import LinkedEdges
+from ..pose_frames import PoseFrames
+from ..recognition import Recognition
+from ..region_features import RegionFeatures
+from ..registration import Registration
+from .scene import SCENE
 
 TEXT = """
 Everything together: two images and a flat one go in, a grasp comes out.
@@ -89,16 +90,16 @@ class PickPictures(Stage):
         import numpy as np
         import rerun as rr
 
-        from stages.lessons.charts import BAD_COLOUR, GOOD_COLOUR, log_texts
-        from stages.matching.pose import outline_m, project
-        from stages.matching.show import (
+        from ..matching.pose import outline_m, project
+        from ..matching.show import (
             AXIS_COLOURS,
             MODEL_COLOUR,
             axes_of,
             candidate_marks,
             region_outlines,
         )
-        from stages.show import edge_image, grey_image, log_map
+        from ..show import edge_image, grey_image, log_map
+        from .charts import BAD_COLOUR, GOOD_COLOUR, log_texts
 
         artifacts = logged.artifacts
         calibration, database = artifacts["calibration"], artifacts["models"]
@@ -149,8 +150,8 @@ class PickPictures(Stage):
     def views(self, logged: Logged) -> list[Any]:
         import rerun.blueprint as rrb
 
-        from stages.lessons.charts import picture_view
-        from stages.show import map_view
+        from ..show import map_view
+        from .charts import picture_view
 
         shape = logged.artifacts["depth_m"].shape
         return [

@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.arrays import read_arrays
-from stages.edges.planes import Plane
-from stages.matching.eigenspace import POINTS, Eigenspace, build, matches
-from stages.matching.surfaces import PROFILE_SECTORS, Surface, fall_off, features_mm, soft_view
 from workbench.digest import digest_of
 from workbench.files import replacing
+
+from ..arrays import read_arrays
+from ..edges.planes import Plane
+from .eigenspace import POINTS, Eigenspace, build, matches
+from .surfaces import PROFILE_SECTORS, Surface, fall_off, features_mm, soft_view
 
 __all__ = [
     "Database", "Part", "View", "calibration_digest", "make_database", "turn_profile", "view_of",
@@ -185,7 +186,7 @@ class Database:
 
     def log(self, recording: Any) -> Any:
         """Log what training found to a ``rerun.RecordingStream``; returns the layout for it."""
-        from stages.matching.report import blueprint, log_database
+        from .report import blueprint, log_database
 
         log_database(recording, self)
         return blueprint(self)

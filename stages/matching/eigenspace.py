@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft2
 from scipy.interpolate import CubicSpline
 
-from stages.matching.surfaces import Surface, soft_view
+from .surfaces import Surface, soft_view
 
 __all__ = [
     "OUTLINE_STEP_DEG", "POINTS", "Eigenspace", "Match", "Outlines", "build", "match", "matches",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.edges.planes import Camera
+from ..edges.planes import Camera
 
 __all__ = ["Cover", "covers"]
 

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, rfft2
 
-from stages.matching.database import Database
-from stages.matching.eigenspace import OUTLINE_STEP_DEG, Eigenspace
-from stages.matching.surfaces import Surface, grid_px, upright_view
+from .database import Database
+from .eigenspace import OUTLINE_STEP_DEG, Eigenspace
+from .surfaces import Surface, grid_px, upright_view
 
 __all__ = ["Visible", "name_by_what_shows"]
 

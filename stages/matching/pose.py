@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.matching.database import Database, Part, turn_profile
-from stages.matching.eigenspace import POINTS, Match
-from stages.matching.recognise import match_part
-from stages.matching.surfaces import Surface, camera_from_surface, fall_off, shortest_turn
+from .database import Database, Part, turn_profile
+from .eigenspace import POINTS, Match
+from .recognise import match_part
+from .surfaces import Surface, camera_from_surface, fall_off, shortest_turn
 
 __all__ = ["choose_turn", "outline_mm", "pose_of", "project"]
 

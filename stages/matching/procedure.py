@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from stages.edges.inputs import best_depth
-from stages.edges.planes import background_plane
-from stages.matching.database import (
+from workbench.stage import StageParameters, knob
+
+from ..edges.inputs import best_depth
+from ..edges.planes import background_plane
+from .database import (
     Database,
     View,
     calibration_digest,
     make_database,
     view_of,
 )
-from stages.matching.surfaces import cut_out
-from workbench.stage import StageParameters, knob
+from .surfaces import cut_out
 
 _FLAT_M = 1.2e-3
 _KNOWN = 0.5

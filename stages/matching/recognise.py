@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from stages.edges.planes import Camera
-from stages.matching.database import Database, Part, turn_profile
-from stages.matching.eigenspace import Match, matches
-from stages.matching.occlusion import covers
-from stages.matching.partial import name_by_what_shows
-from stages.matching.surfaces import (
+from ..edges.planes import Camera
+from ..wording import apart
+from .database import Database, Part, turn_profile
+from .eigenspace import Match, matches
+from .occlusion import covers
+from .partial import name_by_what_shows
+from .surfaces import (
     PROFILE_SECTORS,
     RING_PX,
     Surface,
@@ -23,7 +24,6 @@ from stages.matching.surfaces import (
     shortest_turn,
     soft_view,
 )
-from stages.wording import apart
 
 __all__ = [
     "Reason", "Rules", "checks", "contradiction", "explain_row", "find_candidates", "match_part",

@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from stages.matching.eigenspace import POINTS
-from stages.show import DARK
+from ..show import DARK
+from .eigenspace import POINTS
 
 if TYPE_CHECKING:
-    from stages.matching.database import Database, Part
+    from .database import Database, Part
 
 __all__ = ["blueprint", "log_database"]
 

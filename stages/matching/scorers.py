@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stages.edges.planes import Camera, fit_plane
-from stages.matching.surfaces import shortest_turn
 from workbench.stage import Score, Scorer
+
+from ..edges.planes import Camera, fit_plane
+from .surfaces import shortest_turn
 
 __all__ = ["PoseScorer", "RecognitionScorer", "covered_px", "truth_of_surface"]
 

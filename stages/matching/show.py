@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from stages.matching.database import Database
-from stages.matching.recognise import Reason, Rules, explain_row
+from .database import Database
+from .recognise import Reason, Rules, explain_row
 
 __all__ = [
     "AXIS_COLOURS", "MODEL_COLOUR", "axes_of", "candidate_marks", "candidates_page", "pose_page",

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import find_contours
 
-from stages.edges.planes import Camera, Plane
+from ..edges.planes import Camera, Plane
 
 __all__ = [
     "FEATURES",

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import j1
 
-from stages.optics.rig import Channel, Pattern, Rig
+from .rig import Channel, Pattern, Rig
 
 DOT_DIAMETER = 0.5
 """Diameter of a dot in periods of the pattern ``dots``."""

@@ -19,7 +19,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import pydantic
 
-from stages.optics.thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
+from .thin_lens import blur_circle_mm, image_distance_mm, object_distance_mm
 
 Channel = Literal["near", "far"]
 Pattern = Literal["stripes", "sine", "checker", "dots", "none"]
@@ -391,7 +391,7 @@ class Rig(pydantic.BaseModel):
         the blur circle at the other plane is larger than the pattern's period (or, without a
         projector, than texture of 5 pixels).
         """
-        from stages.optics.analytic import ratio
+        from .analytic import ratio
 
         near, far = self.near_focus_mm, self.far_focus_mm
         values = ratio(self, np.linspace(near, far, 201))

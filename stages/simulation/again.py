@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from stages.simulation.bodies import Body, Mesh, marks, square
-from stages.simulation.scene import MARK_LIFT_MM, Table
 from workbench.errors import DataError
 from workbench.recording import Truth
+
+from .bodies import Body, Mesh, marks, square
+from .scene import MARK_LIFT_MM, Table
 
 _MARKS_REACH_MM = 150.0
 _MARK_ALBEDO = 0.6

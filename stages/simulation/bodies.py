@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.errors import DataError
+from workbench.extras import required
 
 _SAME_DIRECTION = np.cos(np.deg2rad(0.5))
 _SAME_OFFSET = 1e-3
@@ -85,10 +86,9 @@ def load_mesh(path: Path) -> Mesh:
 
     Raises :class:`DataError` for a file that is missing or holds no triangles.
     """
-    import open3d as o3d
-
     if not path.is_file():
         raise DataError(f"{path}: expected a mesh, found no such file")
+    o3d = required("open3d", "reading a mesh", "simulate")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         read = o3d.io.read_triangle_mesh(path)
     read.remove_duplicated_vertices()

@@ -6,7 +6,6 @@ z up towards the camera; millimetres outside this module, metres inside the engi
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from stages.simulation.bodies import Mesh
-from workbench.errors import DataError
+from workbench.extras import required
+
+from .bodies import Mesh
 
 _STEP_S = 0.001
 _DROP_EVERY_S = 0.35
@@ -40,12 +40,9 @@ class Pile:
 
 def require_engine() -> None:
     """Raises :class:`DataError`, naming the extra, where the physics engine is not installed."""
-    for name in ("mujoco", "coacd"):
-        if importlib.util.find_spec(name) is None:
-            raise DataError(
-                f"a pile needs {name}, which is not installed: pip install "
-                "'defocus-workbench[simulate]'"
-            )
+    # CoACD's library breaks the import of Open3D's unless it comes second.
+    for name in ("open3d", "coacd", "mujoco"):
+        required(name, "a pile", "simulate")
 
 
 def drop(
@@ -135,8 +132,6 @@ def _convex_pieces(mesh: Mesh) -> list[tuple[np.ndarray, np.ndarray]]:
     volume = abs(float((a * np.cross(b, c)).sum() / 6))
     if hull.volume <= volume * (1 + _CONVEX):
         return [(mesh.vertices_mm, mesh.triangles)]
-    # CoACD's library breaks the import of Open3D's unless it comes second.
-    import open3d  # noqa: F401, I001
     import coacd
 
     coacd.set_log_level("error")

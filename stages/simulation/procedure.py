@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.optics.rig import CHANNELS, Channel
-from stages.simulation.render import Rendering, render
-from stages.simulation.scene import FrameSpec, Scene
-from stages.simulation.sensor import WHITE_ALBEDO
+from workbench.extras import required
 from workbench.procedures import SimulatedFrame
 from workbench.recording import Truth
+
+from ..optics.rig import CHANNELS, Channel
+from .render import Rendering, render
+from .scene import FrameSpec, Scene
+from .sensor import WHITE_ALBEDO
 
 _START_NS = 1_700_000_000_000_000_000
 _PERIOD_NS = 100_000_000
@@ -24,6 +26,7 @@ class Procedure:
 
     def __init__(self, path: Path, seed: int) -> None:
         self._scene = Scene.open(path)
+        required("open3d", "rendering a scene", "simulate")
         self._seed = seed
 
     def __len__(self) -> int:

@@ -20,11 +20,13 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from stages.optics.analytic import disc_transfer, pattern_mean, pattern_value
-from stages.optics.rig import CHANNELS, Channel, Pattern, Projector, Rig
-from stages.simulation import rays
-from stages.simulation.bodies import Body
 from workbench.errors import DataError
+from workbench.extras import required
+
+from ..optics.analytic import disc_transfer, pattern_mean, pattern_value
+from ..optics.rig import CHANNELS, Channel, Pattern, Projector, Rig
+from . import rays
+from .bodies import Body
 
 _RAYS_AT_ONCE = 1 << 19
 _PATTERN_CELLS = {"stripes": (1, 1024), "sine": (1, 256), "none": (1, 1)}
@@ -119,8 +121,7 @@ class _Tracer:
         seed: int,
         pool: ThreadPoolExecutor,
     ) -> None:
-        import open3d as o3d
-
+        o3d = required("open3d", "ray casting", "simulate")
         self.rig, self.lighting, self.paths, self.seed = rig, lighting, paths, seed
         self._pool = pool
         self._tensor = o3d.core.Tensor

@@ -22,11 +22,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 import pydantic
 
-from stages.optics.rig import Rig, mistake
-from stages.simulation.bodies import Body, Mesh, load_mesh, marks, square
-from stages.simulation.render import Lighting, require_in_front
-from stages.simulation.sensor import Exposure, Sensor
 from workbench.errors import DataError
+
+from ..optics.rig import Rig, mistake
+from .bodies import Body, Mesh, load_mesh, marks, square
+from .render import Lighting, require_in_front
+from .sensor import Exposure, Sensor
 
 _CONFIG = pydantic.ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 _PILE_ATTEMPTS = 20
@@ -314,7 +315,7 @@ class Pile(_Series):
         return self
 
     def makers(self, around: Surroundings) -> Iterator[Maker]:
-        from stages.simulation.piles import require_engine
+        from .piles import require_engine
 
         require_engine()
         names = self.parts if self.parts is not None else list(around.meshes)
@@ -326,7 +327,7 @@ class Pile(_Series):
             yield lambda seed: self._pile(around, names, seed)
 
     def _pile(self, around: Surroundings, names: list[str], seed: Sequence[int]) -> FrameSpec:
-        from stages.simulation.piles import drop
+        from .piles import drop
 
         rng = np.random.default_rng(list(seed))
         count = int(rng.integers(self.pieces[0], self.pieces[1] + 1))
@@ -537,6 +538,6 @@ def _downwards(normal: np.ndarray) -> np.ndarray:
 
 def _visible(rig: Rig, bodies: list[Body]) -> float:
     """How much of the first body a pinhole sees, in pixels, finer than whole ones."""
-    from stages.simulation.render import visible_area_px
+    from .render import visible_area_px
 
     return visible_area_px(rig, bodies, bodies[0].instance)

@@ -6,15 +6,18 @@ The libraries decode; this module knows only what the fields are called in each 
 from __future__ import annotations
 
 import base64
+import contextlib
+import io
 import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Schema
+from mcap.well_known import SchemaEncoding
 from numpy.typing import NDArray
 
 from workbench.recording.container import RawMessage
@@ -118,13 +121,22 @@ class Decoder:
 
             self._factories = (ProtobufDecoders(), Ros2Decoders())
         for factory in self._factories:
-            decoder: Callable[[bytes], Any] | None = factory.decoder_for(
-                channel.message_encoding, schema
-            )
+            # The ROS 2 library tells of a definition that it cannot read on stderr, too.
+            with contextlib.redirect_stderr(io.StringIO()):
+                decoder: Callable[[bytes], Any] | None = factory.decoder_for(
+                    channel.message_encoding, _tidy(schema)
+                )
             if decoder is not None:
                 return decoder
         found = f"schema {schema.name} in {schema.encoding}" if schema else "no schema"
         raise MessageError(f"{channel.message_encoding} message with {found} is not supported")
+
+
+def _tidy(schema: Schema | None) -> Schema | None:
+    """A ROS 2 definition without white space at the ends of lines, which hides its separators."""
+    if schema is None or schema.encoding != SchemaEncoding.ROS2:
+        return schema
+    return replace(schema, data=b"\n".join(line.rstrip() for line in schema.data.splitlines()))
 
 
 # -- fields ---------------------------------------------------------------------------------------

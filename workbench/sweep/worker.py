@@ -168,7 +168,7 @@ def _kept(opened: _Opened, stage: Stage, key: str, run: Run, picture: bool) -> t
     Nothing of it depends on stages that come later.
     """
     record: dict[str, Any] = {}
-    failure = next((one for one in run.failures if one.stage == stage.name), None)
+    failure = run.failure_of(stage.name)
     index = run.frame.index
     if failure is not None:
         record["says"] = failure.says

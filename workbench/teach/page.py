@@ -41,9 +41,9 @@ class LessonCanvas(Canvas):
     def _show_recorded(self, layer: Any, run: Run) -> bool:
         return False
 
-    def _show_stage(self, layer: Any, stage: Stage, part: Part, run: Run, failed: bool) -> bool:
+    def _show_stage(self, layer: Any, stage: Stage, part: Part, run: Run) -> bool:
         shown = stage.name in self.shows
-        return shown and super()._show_stage(layer, stage, part, run, failed)
+        return shown and super()._show_stage(layer, stage, part, run)
 
     def _overview(self, part: Part, run: Run) -> Any:
         views = [view for name in self.shows for view in self._views(name, part, run)]

@@ -137,10 +137,9 @@ class Canvas:
     def show(self, part: Part, run: Run) -> None:
         layer = self._layers.setdefault(part.prefix, _Layer(self.recording, part.prefix))
         drawn = self._show_recorded(layer, run)
-        failed = {failure.stage for failure in run.failures}
         for stage in self.pipeline.stages:
-            if stage.name in run.stage_ms or stage.name in failed:
-                drawn |= self._show_stage(layer, stage, part, run, stage.name in failed)
+            if stage.name in run.stage_ms or run.failure_of(stage.name) is not None:
+                drawn |= self._show_stage(layer, stage, part, run)
         if drawn and run.computed:
             self._flush()
 
@@ -227,11 +226,12 @@ class Canvas:
         layer.end(RECORDED)
         return True
 
-    def _show_stage(self, layer: _Layer, stage: Stage, part: Part, run: Run, failed: bool) -> bool:
+    def _show_stage(self, layer: _Layer, stage: Stage, part: Part, run: Run) -> bool:
+        failure = run.failure_of(stage.name)
         parameters = part.settings.parameters[stage.name]
         names = [a.name for a in (*stage.needs, *stage.gives)]
         key = (
-            failed,
+            failure,
             run.frame.index,
             parameters.model_dump_json(),
             *(run.digests.get(name) for name in names),
@@ -243,11 +243,12 @@ class Canvas:
         self.troubles.pop(stage.name, None)
         layer.begin()
         try:
-            if not failed:
+            if failure is None or failure.gave:
                 stage.log(layer, Logged(run.artifacts, parameters, run.frame.truth))
                 layer.sound.add(stage.name)
         except Exception as error:
-            self.troubles[stage.name] = f"its pictures: {one_line(error)}"
+            if failure is None:
+                self.troubles[stage.name] = f"its pictures: {one_line(error)}"
         finally:
             layer.end(stage.name)
         return True

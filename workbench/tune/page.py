@@ -442,8 +442,8 @@ class _StagePanel:
         run = snapshot.run
         failure = ""
         if run is not None:
-            failure = next((f.says for f in run.failures if f.stage == self.name), "")
-            failure = failure or self.page.canvas.troubles.get(self.name, "")
+            failed = run.failure_of(self.name)
+            failure = failed.says if failed else self.page.canvas.troubles.get(self.name, "")
             milliseconds = run.stage_ms.get(self.name)
             self.time.text = "" if milliseconds is None else f"{milliseconds:.1f} ms"
             ran = self.name in run.computed
