@@ -732,6 +732,12 @@ def main() -> None:
     except (DataError, OSError) as error:
         print(f"workbench: {one_line(error)}", file=sys.stderr)
         code = EXIT_FAILED
+    except ImportError as error:
+        # A library that is not there, or that lacks another; in our own modules it is a bug.
+        if (error.name or "").startswith("workbench"):
+            raise
+        print(f"workbench: {one_line(error)}", file=sys.stderr)
+        code = EXIT_FAILED
     except Exception as error:
         # A wrong flag.  Typer carries its own click, whose base class it does not export.
         if not hasattr(error, "format_message"):

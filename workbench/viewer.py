@@ -8,7 +8,6 @@ the SDK's own ``spawn`` and ``serve`` functions cannot be told.
 from __future__ import annotations
 
 import importlib
-import os
 import shlex
 import shutil
 import socket
@@ -25,6 +24,7 @@ from typing import Any
 
 import rerun as rr
 
+from workbench.display import has_display
 from workbench.errors import DataError
 from workbench.files import replacing
 
@@ -48,13 +48,6 @@ class Destinations:
     save: Path | None = None
     screenshot: Path | None = None
     window: tuple[int, int] = (1920, 1080)
-
-
-def has_display() -> bool:
-    """Whether a window can be opened here."""
-    if sys.platform.startswith("linux"):
-        return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    return True
 
 
 @dataclass

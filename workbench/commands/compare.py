@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from workbench import interrupts
 from workbench.console import end, err, interruptible, out, table, tracked, troubles
+from workbench.display import has_display
 from workbench.errors import DataError, UsageError
 from workbench.files import check_output
 from workbench.plugins import find_stages
@@ -259,7 +260,7 @@ class _Targets:
     def opened(self, name: str, comparison: Comparison) -> Iterator[Stream | None]:
         """The stream to log to; None where nobody would see the pictures."""
         from workbench.digest import digest_of
-        from workbench.viewer import Destinations, has_display, opened
+        from workbench.viewer import Destinations, opened
 
         asked = self.web or self.save is not None or self.screenshot is not None
         native = has_display() and not (self.web or self.screenshot or self.as_json)

@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from workbench.console import closing_tables, end, err, interruptible, out, tracked
+from workbench.display import has_display
 from workbench.errors import DataError, UsageError
 from workbench.files import check_output
 from workbench.pipeline import ResultStore
@@ -31,7 +32,7 @@ def run(
     # Rerun is imported only now: a mistake in the flags or the recording is told at once.
     from workbench.bridge import Bridge
     from workbench.digest import digest_of
-    from workbench.viewer import Destinations, has_display, how_to_open, opened
+    from workbench.viewer import Destinations, how_to_open, opened
 
     native = not (web or save or screenshot)
     if native and not has_display():

@@ -14,7 +14,9 @@ import typer
 
 from workbench.commands.replay import window_size
 from workbench.console import err, out, progress_to, table
-from workbench.errors import EXIT_FAILED
+from workbench.display import has_display
+from workbench.errors import EXIT_FAILED, DataError
+from workbench.extras import required
 from workbench.files import check_output
 from workbench.report import finite, to_json
 from workbench.sweep import run as sweeping
@@ -34,6 +36,14 @@ def run(
     size = window_size(window)
     if screenshot is not None:
         check_output("--screenshot", screenshot)
+    if view or screenshot is not None:
+        _require_catalog()
+    elif view is None and has_display() and not as_json:
+        try:
+            _require_catalog()
+        except DataError as error:
+            _warn(str(error))
+            view = False
     cards = 0
 
     def draw(sweep: Sweep, cache: Cache) -> None:
@@ -58,6 +68,12 @@ def run(
         raise typer.Exit(EXIT_FAILED)
 
 
+def _require_catalog() -> None:
+    """Raise :class:`DataError` where what Rerun's catalog stands on is not installed."""
+    for module in ("datafusion", "pandas"):
+        required(module, "the gallery of a sweep", "gallery")
+
+
 def _warn(says: str) -> None:
     err.print(f"warning: {says}", style="yellow", soft_wrap=True, markup=False)
 
@@ -71,7 +87,7 @@ def _show(
 ) -> None:
     """Open the gallery where there is a display or one is asked for, and take its picture."""
     from workbench.sweep.gallery import CELL_TIMELINE, OVERVIEW, served
-    from workbench.viewer import has_display, how_to_open, show, take_screenshot
+    from workbench.viewer import how_to_open, show, take_screenshot
 
     folder = sweep.request.folder
     overview = folder / OVERVIEW

@@ -14,6 +14,7 @@ import typer
 from workbench import interrupts
 from workbench.commands.replay import free_name, window_size
 from workbench.console import err, out, progress, table
+from workbench.display import has_display
 from workbench.errors import EXIT_FAILED, DataError, UsageError
 from workbench.files import check_output
 from workbench.pipeline import ResultStore
@@ -180,7 +181,7 @@ def _live(
     browser: bool,
 ) -> None:
     """The page; where there is neither a display nor a wish for none, the lesson as a file."""
-    from workbench.viewer import free_port, has_display, how_to_open
+    from workbench.viewer import free_port, how_to_open
 
     if browser and not has_display():
         OpenLesson.open(first, assignments)

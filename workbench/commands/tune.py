@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from workbench import interrupts
 from workbench.console import err
+from workbench.display import has_display
 from workbench.errors import DataError, UsageError
 from workbench.report import to_json
 from workbench.session import Options, Session
@@ -30,7 +31,7 @@ def run(options: Options, port: int | None, browser: bool, native: bool, as_json
     session = Session.open(options)
     if session.count() == 0:
         raise DataError(f"{options.recording}: no frame in it, or in --frames")
-    from workbench.viewer import free_port, has_display
+    from workbench.viewer import free_port
 
     if native:
         if not has_display():

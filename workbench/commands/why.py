@@ -12,6 +12,7 @@ from rich.markup import escape
 from workbench import interrupts
 from workbench.commands.replay import window_size
 from workbench.console import err, out, progress, table
+from workbench.display import has_display
 from workbench.errors import EXIT_FAILED, DataError, UsageError
 from workbench.files import check_output
 from workbench.pipeline import Run
@@ -141,7 +142,6 @@ def _show(
     quiet: bool,
 ) -> None:
     """The frame's pictures with the pixel marked, and the story beside them."""
-    from workbench.viewer import has_display
 
     native = screenshot is None and not quiet and has_display()
     if not (native or save or screenshot):

@@ -6,14 +6,13 @@ handed over as it comes.
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import Any
 
 from workbench import interrupts
-from workbench.errors import DataError, UsageError, one_line
+from workbench.errors import DataError, one_line
+from workbench.extras import required
 from workbench.sweep.plan import Job, Task
 from workbench.sweep.worker import Outcome, work
 
@@ -88,13 +87,7 @@ def _on_machine(job: Job, tasks: Sequence[Task], workers: int) -> Iterator[Outco
 
 
 def _on_cluster(job: Job, tasks: Sequence[Task], scheduler: str) -> Iterator[Outcome]:
-    try:
-        # Dask is untyped, and an extra that need not be there.
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError:
-        raise UsageError(
-            "--scheduler: needs Dask distributed: pip install 'defocus-workbench[cluster]'"
-        ) from None
+    distributed = required("distributed", "--scheduler", "cluster")
     try:
         client = distributed.Client(scheduler, timeout=10, set_as_default=False)
     except (OSError, ValueError) as error:

@@ -26,7 +26,6 @@ from rerun.blueprint.table import CardLayout, Column, PreviewCell, PreviewsConfi
 
 from workbench.digest import digest_of
 from workbench.errors import DataError
-from workbench.extras import required
 from workbench.files import replacing
 from workbench.sweep.analysis import Choice, curve, main_effects, surface
 from workbench.sweep.axes import Axis
@@ -103,19 +102,13 @@ def write(sweep: Sweep, cache: Cache, command: Command) -> int:
     return len(shown)
 
 
-def require_catalog() -> None:
-    """Raise :class:`DataError` where what Rerun's catalog stands on is not installed."""
-    for module in ("datafusion", "pandas"):
-        required(module, "the gallery of a sweep", "gallery")
-
-
 @contextmanager
 def served(folder: Path) -> Iterator[str]:
     """A server on loopback for the gallery in ``folder``; yields the address that shows it.
 
-    Raises :class:`DataError` where Rerun's catalog is not installed or cannot serve it.
+    Needs Rerun's catalog (:func:`require_catalog`).  Raises :class:`DataError` where it cannot
+    serve the gallery.
     """
-    require_catalog()
     files = sorted((folder / GALLERY).glob("*.rrd"))
     try:
         server = rr.server.Server(host=LOOPBACK, datasets={"sweep": files})
