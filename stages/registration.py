@@ -170,10 +170,14 @@ class Registration(Stage):
         drift_px = misalignment_rms_px(near, far)
         if drift_px > _DRIFT_WARNING_PX:
             warnings.append(f"near and far are {drift_px:.1f} px apart after registration")
+        if flat is not None and flat.shape[:2] != near.shape:
+            warnings.append(
+                f"flat is {_size(flat)}, near is {_size(near_raw)}: the intensity is that of near "
+                "and far, with the stripes averaged out"
+            )
+            flat = None
         if flat is not None and parameters.intensity == "flat":
             intensity = grey(flat)
-            if intensity.shape != near.shape:
-                raise StageError(f"flat is {_size(flat)}, near is {_size(near_raw)}")
         else:
             intensity = average_over_period(cv2.addWeighted(near, 0.5, far, 0.5, 0), stripes)
         return {
