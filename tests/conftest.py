@@ -1,19 +1,27 @@
-"""What the tests of the bench share: the committed recordings, twins of them, and the commands."""
+"""What the tests of the bench share: the committed recordings, twins of them, and the commands.
+
+Also what a test needs of the machine, and which of them run beside each other; see CONTRIBUTING.md.
+"""
 
 from __future__ import annotations
 
+import functools
+import importlib
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
+import rooms
 from mcap_fixtures import PERIOD_NS, START_NS, Recorder
 
 from workbench.recording import Frame, Recording
@@ -22,6 +30,140 @@ ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "recordings" / "scene.mcap"
 CALIBRATION = SCENE.with_name("scene.calibration.npz")
 MODELS = SCENE.with_name("scene.models.npz")
+
+# -- which tests run, and where -------------------------------------------------------------------
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--no-skips",
+        action="store_true",
+        help="a test that would be skipped fails: for a machine that must have everything (CI)",
+    )
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    if wrong := rooms.problem(Path(__file__).parent):
+        raise pytest.UsageError(wrong)
+    for room, says in rooms.ROOMS.items():
+        config.addinivalue_line("markers", f"{room}: {says}")
+    # Of pytest-xdist, which need not be there: with -n the tests of a file stay together.
+    if config.getoption("dist", "no") == "load":
+        config.option.dist = "loadgroup"
+        config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        item.add_marker(rooms.FILES[item.path.stem])
+        if "browser" in item.keywords:
+            item.add_marker("slow")
+    if config.getoption("dist", "no") == "no":
+        return
+    # What a file makes once is made in one process; what draws with the processor alone is drawn
+    # in one as well, for two at once would take turns.
+    long = {item.path for item in items if "slow" in item.keywords}
+    for item in items:
+        drawn = any(name in item.keywords for name in ("browser", "vulkan"))
+        item.add_marker(pytest.mark.xdist_group("drawn" if drawn else item.path.stem))
+    # What takes longest comes first, so that both end together.
+    items.sort(key=lambda item: ("browser" not in item.keywords, item.path not in long))
+
+
+# -- what a test needs of the machine -------------------------------------------------------------
+
+
+def missing_browser() -> str:
+    """Why there is no browser for the tests of the pages; empty where there is one."""
+    reason = missing_module("playwright.sync_api")
+    if not reason and chromium() is None:
+        reason = "there is no Chromium (playwright install chromium, or the system's)"
+    return reason
+
+
+@functools.cache
+def chromium() -> str | None:
+    """The program of a Chromium: Playwright's own, or the system's."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        own = playwright.chromium.executable_path
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    return own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
+
+
+def missing_vulkan() -> str:
+    """Why the viewer cannot draw without a screen; empty where it can."""
+    folders = ("/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d", "/usr/local/share/vulkan/icd.d")
+    found = any(path for folder in folders for path in Path(folder).glob("*.json"))
+    return "" if found else "there is no Vulkan driver (Debian: mesa-vulkan-drivers)"
+
+
+def missing_linux() -> str:
+    """Why it cannot be told what processes are at; empty where it can."""
+    return "" if Path("/proc/net/tcp").exists() else "there is no /proc as Linux has it"
+
+
+@functools.cache
+def missing_module(name: str) -> str:
+    """Why a module cannot be imported, be it for a library of the system; empty where it can."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            importlib.import_module(name)
+    except (ImportError, OSError) as error:
+        return f"{name} cannot be imported: {str(error).splitlines()[0]}"
+    return ""
+
+
+MACHINE: dict[str, Callable[[], str]] = {
+    "browser": missing_browser,
+    "vulkan": missing_vulkan,
+    "linux": missing_linux,
+}
+"""By marker, what a test needs beside Python's packages; the marker ``needs`` names packages."""
+
+
+def missing(item: pytest.Item) -> str:
+    """Why a test cannot run on this machine; empty where it can."""
+    reasons = [find() for marker, find in MACHINE.items() if item.get_closest_marker(marker)]
+    named = [name for marker in item.iter_markers("needs") for name in marker.args]
+    return "; ".join(filter(None, [*reasons, *map(missing_module, named)]))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if reason := missing(item):
+        pytest.skip(reason)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    return told(item.config, (yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    return told(collector.config, (yield))
+
+
+Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
+
+
+def told(config: pytest.Config, report: Report) -> Report:
+    """The report as it is; with --no-skips a skip is a failure."""
+    if config.getoption("--no-skips") and report.skipped and not hasattr(report, "wasxfail"):
+        report.outcome = "failed"
+        report.longrepr = f"skipped, with --no-skips: {report.longrepr}"
+    return report
+
+
+# -- recordings and commands ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -182,6 +324,29 @@ def plugin(tmp_path: Path) -> Callable[[str], Path]:
 
     return write
 
+
+@pytest.fixture
+def held(plugin: Callable[[str], Path]) -> Path:
+    """A plugin whose stage stops in the fifth frame until it is interrupted: see ``inside``."""
+    return plugin(HELD)
+
+
+HELD = """
+import time
+from pathlib import Path
+class Held(Stage):
+    name = "held"
+    needs = (recorded_image("near"), Artifact("depth_m", "float32", "H W"))
+    gives = (Artifact("held", "float32", "H W"),)
+    def compute(self, inputs, parameters):
+        # The first call of all is done twice.
+        with Path("calls").open("a") as calls:
+            calls.write(".")
+        if Path("calls").stat().st_size > 5:
+            Path("inside").touch()
+            time.sleep(600)
+        return {"held": inputs["depth_m"].copy()}
+"""
 
 PLUGIN_HEADER = """\
 import numpy as np

@@ -6,7 +6,6 @@ import json
 import re
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,8 @@ import cv2
 import numpy as np
 import pytest
 import typer
-from test_replay import assert_whole, chunks, frames_of, rerun, vulkan_drivers
+from test_replay import assert_whole, chunks, frames_of, rerun
+from waiting import PATIENCE_S, until_running
 
 from workbench.session import Options, Session
 
@@ -418,20 +418,23 @@ def test_a_mistake_is_one_line(
 def test_an_interrupted_comparison_leaves_a_whole_file(
     started: Callable[..., subprocess.Popen[str]],
     long_recordings: dict[int, Path],
+    held: Path,
     tmp_path: Path,
 ) -> None:
-    child = started("compare", long_recordings[120], "--b", "paper", "--save", "a.rrd", "--json")
-    part = tmp_path / "a.rrd.part"
-    deadline = time.monotonic() + 60
-    while not (part.exists() and part.stat().st_size > 1 << 21):
-        assert child.poll() is None and time.monotonic() < deadline
-        time.sleep(0.02)
+    child = started(
+        *("compare", long_recordings[120], "--plugin", held, "--until", "held", "--save", "a.rrd"),
+        *("--b", "registration.correct_gain=false", "--json"),
+    )
+    until_running(child, (tmp_path / "inside").exists, tmp_path / "stderr")
     child.send_signal(signal.SIGTERM)
-    assert child.wait(60) == 143
+    assert child.wait(PATIENCE_S) == 143
     assert_whole(tmp_path / "a.rrd")
     told = json.loads((tmp_path / "stdout").read_text())
-    assert told["interrupted"] and 0 < told["frames"] < 120
-    assert "Traceback" not in (tmp_path / "stderr").read_text()
+    # Both sides of a frame stop at the held stage, once for each frame and side.
+    assert told["interrupted"] and told["frames"] == 2
+    shown = frames_of(tmp_path / "a.rrd")
+    assert shown["A/depth_cloud/confidence"] == shown["B/depth_cloud/confidence"] == {0, 1}
+    assert (tmp_path / "stderr").read_text() == ""
 
 
 def test_the_help_says_that_a_difference_is_no_failure(bench: Command) -> None:
@@ -439,7 +442,8 @@ def test_the_help_says_that_a_difference_is_no_failure(bench: Command) -> None:
     assert "0 whether or not there is a difference" in told
 
 
-@pytest.mark.skipif(not vulkan_drivers(), reason="no Vulkan driver (mesa-vulkan-drivers)")
+@pytest.mark.vulkan
+@pytest.mark.slow
 def test_a_screenshot_shows_the_stage_that_is_asked_for(
     bench: Command, replays: dict[str, Path], tmp_path: Path
 ) -> None:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import signal
 import subprocess
-import time
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import PATIENCE_S, until_running
 
 import workbench
 
@@ -153,47 +153,48 @@ class Depth(Stage):
         assert "focus_near" in file.files and "depth_m" not in file.files
 
 
-def await_that(true: Callable[[], bool], child: subprocess.Popen[str]) -> None:
-    deadline = time.monotonic() + 30
-    while not true():
-        assert child.poll() is None and time.monotonic() < deadline, child.poll()
-        time.sleep(0.01)
-
-
-def interrupted(
-    started: Callable[..., subprocess.Popen[str]], recording: Path, out: Path, sent: int
-) -> int:
-    """Export until some frames are there, send the signal; gives the exit code."""
-    child = started("export", recording, "--to", out)
-    await_that(lambda: len(list(out.glob("frame_*.npz"))) > 3, child)
-    child.send_signal(sent)
-    return child.wait(30)
-
-
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupted_export_keeps_its_lines(
+def test_an_interrupted_export_keeps_what_was_done_and_says_what_it_was_made_with(
     started: Callable[..., subprocess.Popen[str]],
     long_recordings: dict[int, Path],
+    held: Path,
     tmp_path: Path,
     sent: signal.Signals,
     code: int,
 ) -> None:
-    out = tmp_path / "out"
-    ended = interrupted(started, long_recordings[LONG], out, sent)
-    found = lines(out)
-    # A frame of which the line is missing may be there, never a line without its frame.
-    assert 3 <= len(found) < LONG and len(found) in (len(digests(out)), len(digests(out)) - 1)
-    assert [line["index"] for line in found] == list(range(len(found)))
-    for line in found:
-        with np.load(out / f"frame_{line['index']:06d}.npz") as file:
-            assert "depth_m" in file.files
+    recording, out = long_recordings[LONG], tmp_path / "out"
+    child = started("export", recording, "--to", out, "--plugin", held, "--until", "held")
+    until_running(child, (tmp_path / "inside").exists, tmp_path / "stderr")
+    child.send_signal(sent)
+    assert child.wait(PATIENCE_S) == code
+    # Every frame before the one that it was stopped in, and nothing of that one.
+    assert [line["index"] for line in lines(out)] == [0, 1, 2, 3]
+    assert list(digests(out)) == [f"frame_{index:06d}.npz" for index in range(4)]
+    for name in digests(out):
+        with np.load(out / name) as file:
+            assert {"depth_m", "held"} <= set(file.files)
     assert not list(out.glob("*.part"))
-    assert "Traceback" not in (tmp_path / "stderr").read_text()
-    assert ended == code
+    told = json.loads((out / "provenance.json").read_text())
+    assert told["recording"]["name"] == recording.name
+    assert (tmp_path / "stderr").read_text() == ""
+    assert "interrupted" in (tmp_path / "stdout").read_text()
 
 
-def test_an_interrupted_export_says_what_it_was_made_with(
+@pytest.mark.slow
+def test_an_export_that_is_interrupted_anywhere_has_no_line_without_its_frame(
     started: Callable[..., subprocess.Popen[str]], long_recordings: dict[int, Path], tmp_path: Path
 ) -> None:
-    interrupted(started, long_recordings[LONG], tmp_path / "out", signal.SIGINT)
-    assert json.loads((tmp_path / "out" / "provenance.json").read_text())["recording"]
+    """Also while it writes; which moment it is nobody knows."""
+    out = tmp_path / "out"
+    child = started("export", long_recordings[LONG], "--to", out, "--until", "focus_maps")
+    until_running(child, lambda: len(list(out.glob("frame_*.npz"))) > 3, tmp_path / "stderr")
+    child.send_signal(signal.SIGTERM)
+    child.wait(PATIENCE_S)
+    found = [line["index"] for line in lines(out)]
+    assert len(found) >= 3 and found == list(range(len(found)))
+    # A frame of which the line is missing may be there.
+    assert len(digests(out)) - len(found) in (0, 1)
+    for index in found:
+        with np.load(out / f"frame_{index:06d}.npz") as file:
+            assert "focus_near" in file.files
+    assert not list(out.glob("*.part"))

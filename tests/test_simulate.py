@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ from workbench_stages.simulation.bodies import Body, Mesh, load_mesh, square
 from workbench_stages.simulation.render import Lighting, render
 from workbench_stages.simulation.scene import FrameSpec, Scene, Table, stable_rotations
 from workbench_stages.simulation.sensor import Sensor
+
+pytestmark = pytest.mark.needs("open3d")
 
 PARTS = ROOT / "recordings" / "parts"
 SCENES = ROOT / "recordings" / "scenes"
@@ -246,14 +249,42 @@ def test_part_in_the_lens_is_refused() -> None:
         render(SMALL, [Body("cuboid", part("cuboid"), pose, 0.5, 1)])
 
 
-def test_faces_of_the_parts() -> None:
-    counts = {"bar": 6, "cuboid": 6, "frustum": 6, "hex": 8, "lblock": 8, "wedge": 5}
-    for name, count in counts.items():
-        mesh = part(name)
-        assert mesh.faces.max() + 1 == count
-        np.testing.assert_allclose(
-            (mesh.normals * mesh.vertices_mm[mesh.triangles].mean(1)).sum(1) > -5, True
-        )
+def winding(mesh: Mesh, point: np.ndarray) -> float:
+    """How often a closed mesh, anticlockwise from outside, goes round a point: 1 inside, else 0.
+
+    By the solid angles of its triangles (Van Oosterom and Strackee).
+    """
+    a, b, c = (mesh.vertices_mm[mesh.triangles[:, k]] - point for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    triple = (a * np.cross(b, c)).sum(1)
+    below = la * lb * lc + (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
+    return float(np.arctan2(triple, below).sum() / (2 * np.pi))
+
+
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [("bar", 6), ("cuboid", 6), ("frustum", 6), ("hex", 8), ("lblock", 8), ("wedge", 5)],
+)
+def test_faces_of_a_part_are_planes_that_look_outwards(name: str, count: int) -> None:
+    """Of the L too, whose inner faces look towards its middle."""
+    mesh = part(name)
+    assert set(mesh.faces) == set(range(count))
+    corners = mesh.vertices_mm[mesh.triangles]
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1)
+    for middle, normal in zip(corners.mean(1), mesh.normals, strict=True):
+        assert winding(mesh, middle - 0.01 * normal) == pytest.approx(1, abs=0.01)
+        assert winding(mesh, middle + 0.01 * normal) == pytest.approx(0, abs=0.01)
+    planes = []
+    for face in range(count):
+        own = mesh.faces == face
+        normal = mesh.normals[own][0]
+        np.testing.assert_allclose(mesh.normals[own], np.tile(normal, (own.sum(), 1)), atol=1e-5)
+        offsets = corners[own] @ normal
+        np.testing.assert_allclose(offsets, offsets[0, 0], atol=1e-4)
+        planes.append([*normal, offsets[0, 0]])
+    # No plane is told as two faces.
+    apart = np.abs(np.subtract.outer(planes, planes).diagonal(axis1=1, axis2=3)).max(-1)
+    assert (apart + np.eye(count) > 1e-3).all()
 
 
 def test_stable_rotations_stand_on_the_table() -> None:
@@ -316,10 +347,9 @@ def test_occlusion_hides_what_was_asked_for(scene_file: Callable[..., Path]) -> 
     assert 1 - seen / alone == pytest.approx(0.3, abs=0.02)
 
 
+@pytest.mark.needs("open3d", "coacd", "mujoco")
 def test_pile_is_at_rest_and_nothing_is_inside_another(scene_file: Callable[..., Path]) -> None:
     """Concave parts too: no corner or edge point lies more than 0.2 mm inside another part."""
-    pytest.importorskip("mujoco", reason="needs the extra simulate")
-    pytest.importorskip("coacd", reason="needs the extra simulate")
     import open3d as o3d
 
     series = f"lblock = '{PARTS}/lblock.stl'\nhex = '{PARTS}/hex.stl'\n"
@@ -491,12 +521,8 @@ def test_wrong_flags(bench: Command, scene_file: Callable[..., Path]) -> None:
 def test_piles_without_the_engine_name_the_extra(
     bench: Command, scene_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import importlib.util
-
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *a: None if name == "mujoco" else found(name, *a)
-    )
+    # A module that stands there as None is one that is not installed.
+    monkeypatch.setitem(sys.modules, "mujoco", None)
     ended = bench("simulate", scene_file("[[series]]\nkind = 'pile'"), "-o", "out.mcap")
     assert ended.code == 1 and "defocus-workbench[simulate]" in ended.mistake
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import signal
 import sqlite3
-import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import Command
+from conftest import Command, write_again
+from waiting import until_running
 
 from workbench.plugins import find_stages
+from workbench.recording import Frame
 from workbench.session import Options, Session
 from workbench.sweep.analysis import choose, main_effects
 from workbench.sweep.axes import Axis, Grid
@@ -78,8 +81,13 @@ class Darkest(Stage):
         if p.mood == "die" and not marker.exists():
             marker.touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        if p.mood == "slow":
-            time.sleep(0.15)
+        if p.mood == "held" and (HERE / "held").exists():
+            # After some frames, for as long as it takes to be killed.
+            if (HERE / "computed.txt").read_text().split().count(self.name) > int(
+                (HERE / "held").read_text()
+            ):
+                (HERE / "inside").touch()
+                time.sleep(600)
         out = inputs["darkness"].copy()
         out[: p.rows] = False
         return {"darkest": out}
@@ -186,10 +194,14 @@ def test_the_tables_are_the_same_for_any_number_of_workers(
     assert Path("of1/best.toml").read_text() == Path("of2/best.toml").read_text()
 
 
+@pytest.mark.needs("distributed")
+@pytest.mark.process
+@pytest.mark.slow
 def test_the_tables_of_a_cluster_are_the_same_though_a_worker_dies(
     bench: Command, scene: Path, tiny: Path
 ) -> None:
-    distributed = pytest.importorskip("distributed")
+    import distributed
+
     axes = (*GRID, "--axis", "darkest.mood=well,die")
     marker = tiny.parent / "marker"
     marker.touch()
@@ -211,43 +223,27 @@ def test_the_tables_of_a_cluster_are_the_same_though_a_worker_dies(
 def test_a_killed_sweep_goes_on_where_it_was(
     bench: Command, scene: Path, tiny: Path, started: Callable[..., Any], tmp_path: Path
 ) -> None:
-    arguments = (*GRID, "--axis", "darkest.mood=slow,well", "--workers", 1)
+    arguments = (*GRID, "--axis", "darkest.mood=held,well", "--workers", 1)
     shared = ("--plugin", tiny, "--until", "darkest", "--frames", "0:3", *arguments)
+    # A frame costs 18 cells, and the first call of all is done twice: this is in the second frame.
+    (tiny.parent / "held").write_text("25")
     child = started("sweep", scene, *shared, "--to", "killed")
-    store = tmp_path / "killed" / ".cache" / "results.sqlite"
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and not kept_frames(store):
-        time.sleep(0.02)
+    until_running(child, (tiny.parent / "inside").exists, tmp_path / "stderr")
     child.send_signal(signal.SIGKILL)
     child.wait()
-    done = kept_frames(store)
-    assert 0 < done < 3
+    (tiny.parent / "held").unlink()
+    assert kept_frames(tmp_path / "killed" / ".cache" / "results.sqlite") == 1
     said = swept(bench, scene, tiny, *arguments, to="killed")
-    assert said["spent"]["kept"] == 18 * done
+    assert (said["spent"]["kept"], said["spent"]["computed"]) == (18, 36)
     whole = swept(bench, scene, tiny, *arguments, to="whole")
-    assert whole["spent"]["kept"] == 0
+    assert (whole["spent"]["kept"], whole["spent"]["computed"]) == (0, 54)
     assert tables(tmp_path / "killed") == tables(tmp_path / "whole")
 
 
 def kept_frames(store: Path) -> int:
-    """Frames of which a sweep that may be running has kept everything."""
-    if not store.exists():
-        return 0
-    # A copy, for the sweep holds the file itself.
-    copy = store.with_name("copy.sqlite")
-    for suffix in ("", "-wal"):
-        other = store.with_name(store.name + suffix)
-        if other.exists():
-            copy.with_name(copy.name + suffix).write_bytes(other.read_bytes())
-    db = sqlite3.connect(copy)
-    try:
+    """Frames of which a sweep has kept everything."""
+    with closing(sqlite3.connect(store)) as db:
         return int(db.execute("SELECT count(*) FROM frames").fetchone()[0])
-    except sqlite3.DatabaseError:
-        return 0
-    finally:
-        db.close()
-        for suffix in ("", "-wal", "-shm"):
-            copy.with_name(copy.name + suffix).unlink(missing_ok=True)
 
 
 def test_a_worker_that_dies_costs_a_retry(bench: Command, scene: Path, tiny: Path) -> None:
@@ -513,14 +509,29 @@ def test_a_recording_given_twice_is_refused(bench: Command, scene: Path) -> None
 
 
 def test_two_recordings_count_as_one_run(
-    bench: Command, tiny: Path, twins: dict[str, Path]
+    bench: Command, tiny: Path, twins: dict[str, Path], first_frames: list[Frame], tmp_path: Path
 ) -> None:
+    """The second has fewer frames and other images, so that neither can stand for the other."""
+    dimmed = [replace(frame, images=dim(frame.images)) for frame in first_frames[:2]]
+    other = write_again(tmp_path / "other.mcap", dimmed, 2)
     ended = bench(
-        *("sweep", twins["protobuf"], twins["ros2"], "--plugin", tiny, "--until", "darkest"),
+        *("sweep", twins["protobuf"], other, "--plugin", tiny, "--until", "dark"),
         *("--axis", "dark.level=60,90", "--to", "out", "--workers", 1, "--json"),
     )
     assert ended.code == 0, ended.err
-    frames = pq.read_table("out/frames.parquet").to_pylist()
-    assert len(frames) == 2 * 2 * 3
-    shares = [row["dark.share"] for row in frames if row["cell"] == 0]
-    assert shares[:3] == shares[3:]
+    images = [frame.images["near"] for frame in (*first_frames, *dimmed)]
+    rows = pq.read_table("out/frames.parquet").to_pylist()
+    cells = pq.read_table("out/cells.parquet").to_pylist()
+    for cell, level in enumerate((60, 90)):
+        expected = [float((image < level).mean()) for image in images]
+        assert len(set(expected)) == 5
+        own = [row for row in rows if row["cell"] == cell]
+        assert [row["dark.share"] for row in own] == pytest.approx(expected)
+        assert [row["frame"] for row in own] == [0, 1, 2, 0, 1]
+        # Every frame counts alike, whichever recording it is of.
+        assert cells[cell]["dark.share"] == pytest.approx(np.mean(expected))
+    assert len(rows) == 10 and len(cells) == 2
+
+
+def dim(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {channel: image // 2 for channel, image in images.items()}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+from waiting import PATIENCE_S
 
 import workbench
 from workbench.tune.canvas import Canvas, _under, live_recording
@@ -18,44 +20,75 @@ from workbench.tune.live import LiveBench
 
 
 class Drawn:
-    """A live bench on the committed recording, and the bytes that went to the viewer."""
+    """A live bench on the committed recording, and what went to the viewer."""
 
-    def __init__(self, scene: Path, **options: Any) -> None:
-        self.session = workbench.open(scene, **options)
+    def __init__(self, scene: Path, folder: Path) -> None:
+        self.folder = folder
+        self.session = workbench.open(scene)
         self.bench = LiveBench(self.session.pipeline, SessionFrames(self.session))
         recording = live_recording("canvas test")
-        self.pieces = rr.binary_stream(recording)
-        self.sent: list[int] = []
+        self.stream = rr.binary_stream(recording)
+        self.pieces: list[bytes] = []
         self.canvas = Canvas(self.session.pipeline, recording, self._flush)
         self.bench.display = self.canvas
         self.bench.start()
-        assert self.bench.wait(60)
+        assert self.bench.wait(PATIENCE_S)
 
     def _flush(self) -> None:
-        self.sent.append(len(self.pieces.read(flush=True) or b""))
+        self.pieces.append(self.stream.read(flush=True) or b"")
 
-    def bytes_of(self, change: Any) -> int:
-        """What a change sends."""
-        self.sent.clear()
+    def entities(self, change: Callable[[], None]) -> set[str]:
+        """The entities that a change draws."""
+        self.pieces.clear()
         change()
-        assert self.bench.wait(60)
-        return sum(self.sent)
+        assert self.bench.wait(PATIENCE_S)
+        found = set()
+        for piece in filter(None, self.pieces):
+            path = self.folder / "piece.rrd"
+            path.write_bytes(piece)
+            reader = RrdReader(path)
+            # A piece may hold a layout alone.
+            if reader.recordings():
+                found |= {chunk.entity_path.strip("/") for chunk in reader.stream()}
+        return found - {"__properties"}
 
 
 @pytest.fixture(scope="module")
-def drawn(scene: Path) -> Iterator[Drawn]:
-    made = Drawn(scene)
+def drawn(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drawn]:
+    made = Drawn(scene, tmp_path_factory.mktemp("drawn"))
     yield made
     made.bench.close()
 
 
+def owners(entities: set[str]) -> set[str]:
+    return {entity.partition("/")[0] for entity in entities}
+
+
+STAGES = [
+    *("registration", "focus_maps", "depth_cloud", "edge_stack"),
+    *("linked_edges", "region_features", "recognition", "pose_frames"),
+]
+
+
 def test_only_what_changed_is_drawn_again(drawn: Drawn) -> None:
     bench = drawn.bench
-    whole = drawn.bytes_of(bench.redraw)
-    nothing = drawn.bytes_of(lambda: bench.mark(3, 4))
-    edges = drawn.bytes_of(lambda: bench.set({"linked_edges.cone_deg": 41.0}))
-    assert edges < 0.7 * whole
-    assert nothing < 0.2 * whole
+    whole = drawn.entities(bench.redraw)
+    # The cloud lies in the world, which has a camera with its image.
+    assert owners(whole) == {*STAGES, "recorded", "world"}
+    assert whole >= set(drawn.canvas.pictures())
+    # A mark is drawn on every picture, and no picture with it.
+    marks = drawn.entities(lambda: bench.mark(3, 4))
+    assert marks == {f"{picture}/asked_pixel" for picture in drawn.canvas.pictures()}
+    # A parameter: its stage and what is downstream of it, all of theirs.
+    changed = drawn.entities(lambda: bench.set({"linked_edges.cone_deg": 41.0}))
+    downstream = STAGES[STAGES.index("linked_edges") :]
+    assert changed == {entity for entity in whole if entity.partition("/")[0] in downstream}
+    assert drawn.entities(lambda: bench.set({"linked_edges.cone_deg": 41.0})) == set()
+    # Back again is a change as any other; another frame is everything.
+    assert owners(drawn.entities(bench.undo)) == set(downstream)
+    assert owners(drawn.entities(lambda: bench.go_to(1))) == owners(whole)
+    bench.go_to(0)
+    assert bench.wait(PATIENCE_S)
 
 
 def test_a_click_is_on_the_pixel_below_it(drawn: Drawn) -> None:
@@ -80,13 +113,13 @@ def test_a_click_is_on_the_pixel_below_it(drawn: Drawn) -> None:
 def test_pictures_of_a_stage_that_fails_are_cleared(drawn: Drawn) -> None:
     bench = drawn.bench
     bench.set({"edge_stack.lowest": 40.0})
-    assert bench.wait(60)
+    assert bench.wait(PATIENCE_S)
     run = bench.snapshot().run
     assert run is not None and "edge_stack" in {f.stage for f in run.failures}
     assert not [path for path in drawn.canvas.pictures() if path.startswith("edge_stack")]
     assert "depth_cloud/depth/values" in drawn.canvas.pictures()
     bench.undo()
-    assert bench.wait(60)
+    assert bench.wait(PATIENCE_S)
     assert "edge_stack/low" in drawn.canvas.pictures()
 
 
@@ -100,11 +133,11 @@ def test_pictures_that_fail_are_told_beside_the_stage(
     with monkeypatch.context() as broken:
         broken.setattr(stage, "log", log, raising=False)
         drawn.bench.redraw()
-        assert drawn.bench.wait(60)
+        assert drawn.bench.wait(PATIENCE_S)
         assert drawn.canvas.troubles == {"focus_maps": "its pictures: ValueError: no ink"}
         assert "linked_edges/linked" in drawn.canvas.pictures()
     drawn.bench.redraw()
-    assert drawn.bench.wait(60)
+    assert drawn.bench.wait(PATIENCE_S)
     assert not drawn.canvas.troubles
 
 
@@ -113,11 +146,11 @@ def test_differences_and_sides_have_layers_of_their_own(drawn: Drawn) -> None:
     bench.pin("A")
     bench.set({"linked_edges.min_weight": 100.0})
     bench.show("beside")
-    assert bench.wait(60)
+    assert bench.wait(PATIENCE_S)
     pictures = drawn.canvas.pictures()
     assert pictures["A/linked_edges/linked"] == pictures["B/linked_edges/linked"] == (256, 256)
     bench.show("difference")
-    assert bench.wait(60)
+    assert bench.wait(PATIENCE_S)
     found = drawn.canvas._differences["linked_edges"]["edges_linked"]
     assert not found.same and found.states is not None
     a, b = (bench._under[name][1].artifacts["edges_linked"] for name in "AB")
@@ -128,7 +161,7 @@ def test_differences_and_sides_have_layers_of_their_own(drawn: Drawn) -> None:
     bench.show("live")
     bench.unpin("A")
     bench.undo()
-    assert bench.wait(60)
+    assert bench.wait(PATIENCE_S)
 
 
 def test_views_move_under_a_prefix_whole() -> None:

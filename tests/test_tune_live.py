@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-import time
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from waiting import PATIENCE_S, until
 
 import workbench
 from workbench import Artifact, Stage, StageParameters, knob
@@ -67,7 +68,7 @@ class Cutter(Stage):
 
     def compute(self, inputs: Any, p: Any) -> Any:
         ran.append(self.name)
-        GATE.wait(10)
+        GATE.wait(PATIENCE_S)
         if p.over == 13:
             raise ValueError("unlucky")
         return {"mask": inputs["grown"] > p.over}
@@ -83,12 +84,25 @@ class Cutter(Stage):
         return Share()
 
 
+class Count(Stage):
+    """Counts what was marked."""
+
+    name = "count"
+    needs = (Cutter.gives[0],)
+    gives = (Artifact("counted", "int64", "N"),)
+
+    def compute(self, inputs: Any, p: Any) -> Any:
+        ran.append(self.name)
+        return {"counted": np.array([inputs["mask"].sum()], np.int64)}
+
+
 class Log:
     """A display that remembers what it was shown."""
 
     def __init__(self) -> None:
         self.shown: list[tuple[str, Run]] = []
         self.pictures: list[Picture] = []
+        self.ended: list[Picture] = []
 
     def begin(self, picture: Picture) -> None:
         self.pictures.append(picture)
@@ -97,7 +111,7 @@ class Log:
         self.shown.append((part.prefix, run))
 
     def end(self, picture: Picture, runs: Any) -> None:
-        return
+        self.ended.append(picture)
 
     def mark(self, x: int, y: int) -> None:
         return
@@ -115,18 +129,26 @@ def frame_of(value: int) -> Frame:
 STAGES: dict[str, Stage] = {"grow": Grow(), "cut": Cutter()}
 
 
-@pytest.fixture
-def bench() -> Iterator[LiveBench]:
+@contextmanager
+def live(stages: dict[str, Stage]) -> Iterator[LiveBench]:
+    """A live bench that has shown its first frame."""
     GATE.set()
-    ran.clear()
-    made = LiveBench(Pipeline(STAGES, resolve(STAGES)), [frame_of(k) for k in range(5)])
+    made = LiveBench(Pipeline(stages, resolve(stages)), [frame_of(k) for k in range(5)])
     made.display = Log()
     made.start()
-    assert made.wait(10)
-    ran.clear()
-    yield made
-    GATE.set()
-    made.close()
+    try:
+        assert made.wait(PATIENCE_S)
+        ran.clear()
+        yield made
+    finally:
+        GATE.set()
+        made.close()
+
+
+@pytest.fixture
+def bench() -> Iterator[LiveBench]:
+    with live(STAGES) as made:
+        yield made
 
 
 def value(bench: LiveBench, address: str) -> Any:
@@ -151,8 +173,7 @@ def test_only_what_is_downstream_runs_again(bench: LiveBench) -> None:
 def test_the_newest_wins_and_none_queue(bench: LiveBench) -> None:
     GATE.clear()
     bench.set({"cut.over": 0.25}, settled=False)
-    while not ran:
-        time.sleep(0.001)
+    until(lambda: ran)
     before = bench.recomputes
     for k in range(100):
         bench.set({"cut.over": 1 + k / 10}, settled=False)
@@ -166,20 +187,35 @@ def test_the_newest_wins_and_none_queue(bench: LiveBench) -> None:
     assert ran == ["cut", "cut"]
 
 
-def test_a_long_recompute_is_left_for_a_newer_one(bench: LiveBench) -> None:
-    GATE.clear()
-    bench.set({"grow.by": 3.0})
-    while ran[-1:] != ["cut"]:
-        time.sleep(0.001)
-    bench.set({"grow.by": 6.0})
-    time.sleep(0.2)
-    GATE.set()
-    assert bench.wait()
-    log = bench.display
-    assert isinstance(log, Log)
-    assert [p.parts[0].settings.parameters["grow"].by for p in log.pictures[-2:]] == [3, 6]  # type: ignore[attr-defined]
-    complete = [run for _, run in log.shown if "cut" in run.stage_ms]
-    assert float(complete[-1].artifacts["grown"][0, 0]) == 6
+@pytest.mark.parametrize(("patience", "left"), [(0.0, True), (PATIENCE_S, False)])
+def test_a_long_recompute_is_left_for_a_newer_one_and_a_short_one_is_finished(
+    monkeypatch: pytest.MonkeyPatch, patience: float, left: bool
+) -> None:
+    """Whichever takes longer than the bench's patience is long."""
+    monkeypatch.setattr("workbench.tune.live._PATIENCE_S", patience)
+    with live({**STAGES, "count": Count()}) as bench:
+        log = bench.display
+        assert isinstance(log, Log)
+        log.pictures.clear()
+        log.ended.clear()
+        GATE.clear()
+        bench.set({"grow.by": 3.0})
+        until(lambda: ran[-1:] == ["cut"])
+        bench.set({"grow.by": 6.0})
+        GATE.set()
+        assert bench.wait()
+
+        def sums(pictures: list[Picture]) -> list[float]:
+            return [p.settings.parameters["grow"].by for p in pictures]  # type: ignore[attr-defined]
+
+        # What was begun is shown as far as it came; what is downstream of it did not run.
+        assert sums(log.pictures) == [3, 6]
+        assert sums(log.ended) == ([6] if left else [3, 6])
+        whole = ["grow", "cut", "count"]
+        assert ran == ([*whole[:2], *whole] if left else [*whole, *whole])
+        run = bench.snapshot().run
+        assert run is not None and float(run.artifacts["grown"][0, 0]) == 6
+        assert run.artifacts["counted"].tolist() == [16]
 
 
 def test_a_drag_is_one_step_of_the_history(bench: LiveBench) -> None:
@@ -476,15 +512,21 @@ Listener = Callable[[], None]
 
 
 def test_listeners_hear_of_changes_until_they_leave(bench: LiveBench) -> None:
-    heard: list[int] = []
-    leave = bench.subscribe(lambda: heard.append(1))
-    bench.set({"cut.over": 8.0})
-    assert bench.wait()
-    time.sleep(0.05)
-    assert heard
+    first: list[bool] = []
+    second: list[bool] = []
+    leave = bench.subscribe(lambda: first.append(bench.snapshot().busy))
+    bench.subscribe(lambda: second.append(bench.snapshot().busy))
+
+    def set_and_hear(over: float) -> None:
+        """A change, until the last that is told of it: that nothing is busy any more."""
+        second.clear()
+        bench.set({"cut.over": over})
+        until(lambda: False in second)
+
+    set_and_hear(8.0)
+    # They are told in the order in which they came.
+    assert False in first
     leave()
-    heard.clear()
-    bench.set({"cut.over": 9.0})
-    assert bench.wait()
-    time.sleep(0.05)
-    assert not heard
+    first.clear()
+    set_and_hear(9.0)
+    assert first == []

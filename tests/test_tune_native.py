@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
 from conftest import Command
-from test_replay import vulkan_drivers
+from waiting import PATIENCE_S, until
 
 import workbench
 from workbench.stage import StageParameters, knob
@@ -62,7 +61,9 @@ def test_a_blueprint_of_something_else_has_no_sliders() -> None:
     assert indices(views) == {} and active_tab(views) is None
 
 
-@pytest.mark.skipif(not vulkan_drivers(), reason="no Vulkan driver (mesa-vulkan-drivers)")
+@pytest.mark.vulkan
+@pytest.mark.process
+@pytest.mark.slow
 def test_a_slider_of_the_viewer_turns_the_knob(scene: Path) -> None:
     session = workbench.open(scene, until="linked_edges")
     bench = LiveBench(session.pipeline, SessionFrames(session))
@@ -71,16 +72,14 @@ def test_a_slider_of_the_viewer_turns_the_knob(scene: Path) -> None:
         panel = NativePanel(bench, recording, port)
         bench.start()
         bench.focus("linked_edges")
-        assert bench.wait(60)
+        assert bench.wait(PATIENCE_S)
         client = panel._client
 
         def stands() -> dict[str, int]:
             return indices(client.get_blueprint().blueprint)
 
         address = "knobs/linked_edges/min_weight"
-        deadline = time.monotonic() + 60
-        while stands().get(address) != 12 and time.monotonic() < deadline:
-            time.sleep(0.2)
+        until(lambda: stands().get(address) == 12, "the sliders are there")
         panel.poll()
         assert not bench.settings.changed
         blueprint = client.get_blueprint().blueprint
@@ -92,11 +91,14 @@ def test_a_slider_of_the_viewer_turns_the_knob(scene: Path) -> None:
                 chosen = blueprint[f"{path}/TensorSliceSelection"]["TensorSliceSelection"]
                 chosen["indices"] = moved
         client.set_blueprint(blueprint, of="recording")
-        while not bench.settings.changed and time.monotonic() < deadline:
+
+        def turned() -> bool:
             panel.poll()
-            time.sleep(0.2)
+            return bool(bench.settings.changed)
+
+        until(turned, "the knob follows")
         assert bench.settings.changed == {"linked_edges.min_weight": 90.0}
-        assert bench.wait(60)
+        assert bench.wait(PATIENCE_S)
         run = bench.snapshot().run
         assert run is not None and run.computed == {"linked_edges"}
         assert child.poll() is None

@@ -6,7 +6,6 @@ import asyncio
 import json
 import signal
 import subprocess
-import time
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Callable
@@ -19,6 +18,7 @@ import psutil
 import pytest
 from conftest import Command
 from fastapi import FastAPI, Request, WebSocket
+from waiting import PATIENCE_S, until_running
 
 from workbench.tune.server import MAX_BODY_BYTES, Guard, new_token
 
@@ -114,10 +114,29 @@ def test_the_token_opens_the_page_and_leaves_the_address(client: Client) -> None
     assert client.get("/").status_code == 403
     answer = client.get(f"/?token={TOKEN}&frame=3")
     assert answer.text == '"the page"' and str(answer.url) == f"http://{HOST}/?frame=3"
-    cookie = answer.history[0].headers["set-cookie"]
-    assert "HttpOnly" in cookie and "SameSite=strict" in cookie
+    value, *attributes = answer.history[0].headers["set-cookie"].split("; ")
+    assert value == f"workbench_{PORT}={TOKEN}"
+    assert sorted(attributes) == ["HttpOnly", "Path=/", "SameSite=strict"]
     assert client.get("/").status_code == 200
-    assert "default-src 'self'" in answer.headers["content-security-policy"]
+
+
+@pytest.mark.parametrize("path", ["/", "/nothing"])
+def test_what_is_answered_may_talk_to_this_server_alone(inside: Client, path: str) -> None:
+    headers = inside.get(path).headers
+    policy = {}
+    for directive in headers["content-security-policy"].split("; "):
+        name, *sources = directive.split(" ")
+        policy[name] = set(sources)
+    # No source is a host, a scheme of the network or all; what is not named falls to the default.
+    inline, made_here = "'unsafe-inline'", {"data:", "blob:"}
+    assert policy == {
+        "default-src": {"'self'", *made_here},
+        "script-src": {"'self'", inline, "'unsafe-eval'", "blob:"},
+        "style-src": {"'self'", inline},
+        "frame-ancestors": {"'none'"},
+    }
+    assert headers["referrer-policy"] == "no-referrer"
+    assert headers["x-content-type-options"] == "nosniff"
 
 
 @pytest.mark.parametrize("token", ["", "x", TOKEN[:-1], TOKEN + "x", "%C3%A4"])
@@ -174,16 +193,14 @@ def test_tokens_differ() -> None:
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
-def address_of(child: subprocess.Popen[str], folder: Path, seconds: float = 60) -> str:
+def address_of(child: subprocess.Popen[str], folder: Path) -> str:
     """What the started command prints when it is ready."""
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        text = (folder / "stdout").read_text()
-        if text.rstrip().endswith("}"):
-            return str(json.loads(text)["url"])
-        assert child.poll() is None, (folder / "stderr").read_text()
-        time.sleep(0.1)
-    raise AssertionError("the page did not come up")
+
+    def said() -> str:
+        return (folder / "stdout").read_text()
+
+    until_running(child, lambda: said().rstrip().endswith("}"), folder / "stderr")
+    return str(json.loads(said())["url"])
 
 
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM])
@@ -201,15 +218,15 @@ def test_it_listens_on_loopback_alone_and_ends_with_its_children(
     }
     assert listening == {"127.0.0.1"}
     with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(url.partition("?")[0], timeout=10)
+        urllib.request.urlopen(url.partition("?")[0], timeout=PATIENCE_S)
     assert refused.value.code == 403
     refused.value.close()
     opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
-    with opener.open(url, timeout=20) as answer:
+    with opener.open(url, timeout=PATIENCE_S) as answer:
         page = answer.read().decode()
     assert "linked_edges" in page and "token" not in answer.url
     child.send_signal(which)
-    assert child.wait(20) == 0
+    assert child.wait(PATIENCE_S) == 0
     assert "Traceback" not in (tmp_path / "stderr").read_text()
     assert not [process for process in family if process.is_running()]
 

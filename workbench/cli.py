@@ -742,7 +742,11 @@ def main() -> None:
         # A wrong flag.  Typer carries its own click, whose base class it does not export.
         if not hasattr(error, "format_message"):
             raise
-        print(f"workbench: {' '.join(error.format_message().split())}", file=sys.stderr)
+        if type(error).__name__ == "NoArgsIsHelpError":
+            # No command at all: its message is the whole help.
+            print(error.format_message(), file=sys.stderr)
+        else:
+            print(f"workbench: {' '.join(error.format_message().split())}", file=sys.stderr)
         code = EXIT_USAGE
     # Typer itself takes every interruption for Ctrl-C.
     sys.exit(interrupts.exit_code() if code == EXIT_INTERRUPTED else code)

@@ -16,11 +16,11 @@ import sys
 import tempfile
 import time
 import webbrowser
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rerun as rr
 
@@ -28,14 +28,18 @@ from workbench.display import has_display
 from workbench.errors import DataError
 from workbench.files import replacing
 
+T = TypeVar("T")
+
 LOOPBACK = "127.0.0.1"
 APPLICATION_ID = "workbench"
 
 WEB_VIEWER_FILES = ("re_viewer.js", "re_viewer_bg.wasm")
 
 _START_SECONDS = 20.0
+_END_SECONDS = 5.0
 _TOAST_SECONDS = 5.0
 _SETTLE_SECONDS = 20.0
+_SLOW_SECONDS = 120.0
 _POLL_SECONDS = 0.4
 
 
@@ -82,7 +86,7 @@ def opened(destinations: Destinations, recording_id: str) -> Iterator[Stream]:
     recording.set_log_tick_enabled(False)
     sinks: list[Any] = []
     stream = Stream(recording)
-    with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
+    with tempfile.TemporaryDirectory(prefix="workbench-") as folder, ExitStack() as at_last:
         file = _file_for(destinations, Path(folder))
         if file is not None:
             sinks.append(_file_sink(file))
@@ -90,6 +94,9 @@ def opened(destinations: Destinations, recording_id: str) -> Iterator[Stream]:
             port = free_port()
             try:
                 stream.child, stream.web_url = _start_viewer(destinations, port)
+                if destinations.web:
+                    # A browser's server has no window that a person could close.
+                    at_last.callback(_end, stream.child)
                 sinks.append(rr.GrpcSink(f"rerun+http://{LOOPBACK}:{port}/proxy"))
             except DataError as error:
                 # A file that was asked for is not lost for want of a window.
@@ -113,8 +120,6 @@ def opened(destinations: Destinations, recording_id: str) -> Iterator[Stream]:
                 file = file.replace(destinations.save)
             if file is not None and destinations.screenshot is not None and complete:
                 take_screenshot(file, destinations.screenshot, destinations.window)
-            if stream.child is not None and destinations.web:
-                stream.child.terminate()
 
 
 def _file_for(destinations: Destinations, folder: Path) -> Path | None:
@@ -162,15 +167,13 @@ def _start_viewer(
     destinations: Destinations, port: int
 ) -> tuple[subprocess.Popen[bytes], str | None]:
     arguments = [rerun_program(), "--bind", LOOPBACK, "--port", str(port)]
-    url = None
+    url, ports = None, [port]
     if destinations.web:
         web_port = free_port()
+        ports.append(web_port)
         arguments += ["--serve-web", "--web-viewer-port", str(web_port)]
         url = f"http://{LOOPBACK}:{web_port}/?url=rerun%2Bhttp://{LOOPBACK}:{port}/proxy"
-    child = subprocess.Popen(
-        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    _await_port(port, child)
+    child = _start(arguments, *ports)
     if url is not None and has_display():
         webbrowser.open(url)
     return child, url
@@ -179,13 +182,20 @@ def _start_viewer(
 def show(shown: list[str]) -> subprocess.Popen[bytes]:
     """A native viewer with these files and addresses.  Raises :class:`DataError`."""
     port = free_port()
+    return _start([rerun_program(), "--bind", LOOPBACK, "--port", str(port), *shown], port)
+
+
+def _start(arguments: list[str], *ports: int) -> subprocess.Popen[bytes]:
+    """A viewer that listens on ``ports``; none is left where that fails or is interrupted."""
     child = subprocess.Popen(
-        [rerun_program(), "--bind", LOOPBACK, "--port", str(port), *shown],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
+        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
     )
-    _await_port(port, child)
+    try:
+        for port in ports:
+            _await_port(port, child)
+    except BaseException:
+        _end(child)
+        raise
     return child
 
 
@@ -200,7 +210,6 @@ def _await_port(port: int, child: subprocess.Popen[bytes]) -> None:
         with suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=0.5):
             return
         time.sleep(0.05)
-    child.terminate()
     raise DataError(f"the Rerun viewer did not start within {_START_SECONDS:g} s")
 
 
@@ -220,55 +229,69 @@ def take_screenshot(
     from rerun.experimental import ViewerClient
 
     port = free_port()
-    child = subprocess.Popen(
-        [
-            rerun_program(),
-            "--headless",
-            "--bind",
-            LOOPBACK,
-            "--port",
-            str(port),
-            "--window-size",
-            f"{window[0]}x{window[1]}",
-            str(shown),
-        ],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    arguments = [rerun_program(), "--headless", "--bind", LOOPBACK, "--port", str(port)]
+    arguments += ["--window-size", f"{window[0]}x{window[1]}", str(shown)]
+    child = None
     try:
-        _await_port(port, child)
+        child = _start(arguments, port)
         client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
         time.sleep(_TOAST_SECONDS)
         if moment is not None:
-            client.set_time(moment[0], sequence=moment[1])
-        before = b""
-        deadline = time.monotonic() + _SETTLE_SECONDS
-        while time.monotonic() < deadline:
-            now = client.take_screenshot()
-            if now == before:
-                break
-            before = now
-            time.sleep(_POLL_SECONDS)
-        with replacing(picture) as beside:
-            beside.write_bytes(before)
-    except OSError as error:
-        raise DataError(f"{picture}: cannot be written: {error.strerror or error}") from error
-    except (RuntimeError, ConnectionError, DataError) as error:
+            _answered(child, lambda: client.set_time(moment[0], sequence=moment[1]))
+        taken = _settled(lambda: _answered(child, client.take_screenshot))
+    except (RuntimeError, OSError, DataError) as error:
         raise DataError(
             "no screenshot: Rerun's headless viewer needs a Vulkan driver "
             f"(Debian: mesa-vulkan-drivers): {error}"
         ) from error
     finally:
-        _end(child)
+        if child is not None:
+            _end(child)
+    try:
+        with replacing(picture) as beside:
+            beside.write_bytes(taken)
+    except OSError as error:
+        raise DataError(f"{picture}: cannot be written: {error.strerror or error}") from error
+
+
+def _settled(take: Callable[[], bytes]) -> bytes:
+    """The picture when two in a row are the same, or after a while the last one."""
+    before = b""
+    deadline = time.monotonic() + _SETTLE_SECONDS
+    while True:
+        now = take()
+        if now == before or time.monotonic() > deadline:
+            return now
+        before = now
+        time.sleep(_POLL_SECONDS)
+
+
+def _answered(child: subprocess.Popen[bytes], ask: Callable[[], T]) -> T:
+    """What the viewer answers; on a busy machine without a graphics card it needs its time.
+
+    The client gives up after 15 s, however much the viewer has to draw: it is asked again as long
+    as the viewer lives.
+    """
+    deadline = time.monotonic() + _SLOW_SECONDS
+    while True:
+        try:
+            return ask()
+        except OSError:
+            if child.poll() is not None or time.monotonic() > deadline:
+                raise
+        time.sleep(_POLL_SECONDS)
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """End a child, gently first."""
+    """End a child, gently first, and wait until it has ended."""
     child.terminate()
-    with suppress(subprocess.TimeoutExpired):
-        child.wait(timeout=5)
-    if child.poll() is None:
-        child.kill()
+    try:
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(timeout=_END_SECONDS)
+    finally:
+        if child.poll() is None:
+            child.kill()
+            child.wait()
 
 
 def send_blueprint(recording: rr.RecordingStream, blueprint: Any) -> None:
@@ -308,11 +331,8 @@ def native_viewer(headless: bool = False) -> Iterator[tuple[int, subprocess.Pope
     arguments += ["--memory-limit", "2GB", "--server-memory-limit", "256MB"]
     if headless:
         arguments += ["--headless", "--window-size", "1600x900"]
-    child = subprocess.Popen(
-        arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+    child = _start(arguments, port)
     try:
-        _await_port(port, child)
         yield port, child
     finally:
         _end(child)
@@ -327,23 +347,9 @@ def unpack_web_viewer(folder: Path) -> None:
     import urllib.request
 
     port, web_port = free_port(), free_port()
-    child = subprocess.Popen(
-        [
-            rerun_program(),
-            "--serve-web",
-            "--bind",
-            LOOPBACK,
-            "--port",
-            str(port),
-            "--web-viewer-port",
-            str(web_port),
-        ],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    arguments = [rerun_program(), "--serve-web", "--bind", LOOPBACK, "--port", str(port)]
+    child = _start([*arguments, "--web-viewer-port", str(web_port)], web_port)
     try:
-        _await_port(web_port, child)
         for name in WEB_VIEWER_FILES:
             address = f"http://{LOOPBACK}:{web_port}/{name}"
             with (

@@ -281,7 +281,9 @@ class LiveBench:
     def wait(self, seconds: float = 30.0) -> bool:
         """Wait until nothing is wanted and nothing runs; False if that takes longer."""
         with self._lock:
-            return self._lock.wait_for(lambda: not self._busy and self._wish is None, seconds)
+            return self._lock.wait_for(
+                lambda: not self._busy and self._wish is None and self._mark is None, seconds
+            )
 
     # -- what a page does -------------------------------------------------------------------------
 
