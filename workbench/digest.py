@@ -85,7 +85,7 @@ def digest_of_code(module_name: str) -> str:
 
 def _is_first_party(root: str, own: str) -> bool:
     """Whether the top-level package ``root`` belongs to what a stage of package ``own`` is."""
-    if root == own or root == _BENCH or root in _stage_packages():
+    if root in (own, _BENCH) or root in _stage_packages():
         return True
     if root in sys.stdlib_module_names:
         return False
