@@ -182,6 +182,10 @@ class Pipeline:
         """The digest of each stage's code."""
         return dict(self._code)
 
+    def resource_digests(self) -> dict[str, str]:
+        """The digest of each resource that was given."""
+        return {name: digest for name, (_, digest) in self.resources.items()}
+
     def run(self, frame: Frame) -> Run:
         """The frame through all stages.  A stage's exception never hides the others' results."""
         return deque(self.steps(frame), maxlen=1).pop()
