@@ -337,8 +337,21 @@ def test_a_frame_that_cannot_be_read_is_not_waited_for(
     with Cache(tmp_path / "out" / sweeping.CACHE) as cache:
         session = Session.open(Options(recording, plugins=[stages], until="least"))
         cache.put(source_of(session), {1: False}, [])
-    sweep = swept(recording, stages, tmp_path / "out", frames=(1, 2))
-    assert (sweep.spent.computed, sweep.frames) == (0, [[]])
+    for computed in (2, 0):
+        sweep = swept(recording, stages, tmp_path / "out", frames=(0, 2))
+        assert (sweep.spent.computed, sweep.frames) == (computed, [[0]])
+        assert [row.frames for row in sweep.rows] == [1, 1]
+
+
+def test_a_sweep_of_which_no_frame_can_be_read_is_an_error(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    with Cache(tmp_path / "out" / sweeping.CACHE) as cache:
+        session = Session.open(Options(recording, plugins=[stages], until="least"))
+        cache.put(source_of(session), {1: False}, [])
+    with pytest.raises(DataError, match=r"toy\.mcap: no frame that can be read"):
+        swept(recording, stages, tmp_path / "out", frames=(1, 2))
+    assert not (tmp_path / "out" / sweeping.CELLS_TABLE).exists()
 
 
 def test_pictures_that_are_lacking_are_drawn(

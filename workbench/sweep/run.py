@@ -389,6 +389,8 @@ def _finished(
         sorted(set(range(start, stop)) & cache.readable(source))
         for source, (start, stop) in zip(job.sources, spans, strict=True)
     ]
+    if not any(frames):
+        raise DataError(f"{request.recordings[0]}: no frame that can be read")
     metrics: dict[str, Metric] = {}
     rows: dict[int, Row] = {}
     for cell in in_tree_order(cells, pipeline.stages):
