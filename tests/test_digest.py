@@ -69,6 +69,13 @@ def test_one_element_of_an_array_is_enough(place: int) -> None:
     assert digest_of([other]) != digest_of([GRID])
 
 
+def test_one_element_of_a_large_array_is_enough() -> None:
+    array = np.zeros((100, 200))
+    before = digest_of([array])
+    array[50, 100] = 1e-12
+    assert digest_of([array]) != before
+
+
 def test_equal_values_have_one_digest_whatever_their_memory_looks_like() -> None:
     wide = np.zeros((2, 6), np.int32)
     wide[:, ::2] = GRID
@@ -222,6 +229,16 @@ def test_installed_packages_are_not_read_unless_the_stage_is_in_one(
     own = {"toy_third/stage": "from . import part"}
     before = code(own, folder)
     assert code(own | {"toy_third/part": "X = 3"}, folder) != before
+
+
+def test_what_comes_with_python_is_not_read(
+    code: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    whole = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or whole(path))
+    code({"toy_stage": "import json.decoder, colorsys, sys, numpy.linalg"})
+    assert read == ["toy_stage.py"]
 
 
 def test_installed_packages_that_bring_stages_are_read(
