@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from workbench.pipeline import Pipeline, ResultStore, Run, dependencies
+from workbench.pipeline import Failure, Pipeline, ResultStore, Run, dependencies
 from workbench.recording import Camera, Frame
 from workbench.settings import resolve
 from workbench.stage import (
@@ -84,7 +84,7 @@ class Given:
     images: dict[str, np.ndarray]
     camera: Camera | None
     sets: list[str]
-    scale: str = "2"
+    scale: str | None = "2"
     shift: str | None = "3"
     digest: str = "pictures"
     stage: type[Stage] = All
@@ -162,6 +162,22 @@ def test_one_change_runs_a_stage_and_what_follows_again(tmp_path: Path, what: st
         assert repr(second.artifacts[name]) == repr(fresh.artifacts[name])
     # Both are kept beside one another.
     assert before.run(tmp_path, store).computed == changed.run(tmp_path, store).computed == set()
+
+
+def test_a_stage_without_what_it_needs_is_not_run_and_says_what_there_is_not(
+    tmp_path: Path,
+) -> None:
+    for lacking, says in (
+        (replace(given(), scale=None), "there is no scale"),
+        (replace(given(), images={}), "there is no near_image, far_image"),
+    ):
+        run = lacking.run(tmp_path, ResultStore())
+        assert run.failures == (
+            Failure("all", f"not run: {says}"),
+            Failure("after", "not run: all failed", blocked_by="all"),
+        )
+        assert run.computed == frozenset() and run.stage_ms == {}
+        (tmp_path / "scale").unlink(missing_ok=True)
 
 
 def test_what_no_stage_may_take_changes_nothing(tmp_path: Path) -> None:

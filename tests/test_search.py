@@ -206,6 +206,32 @@ def test_the_range_that_is_searched(
     assert found is not None and at <= found.after < at + step + 1e-9
 
 
+class Window(Sum):
+    """A wide range, of which one value alone is over."""
+
+    class Parameters(StageParameters):
+        near: float = knob(3200.0, "Added.", low=0, high=6400, step=10)
+
+    def compute(self, inputs: Mapping[str, Any], parameters: Any) -> dict[str, Any]:
+        over = parameters.near == inputs["left_image"]
+        return {"total": np.where(over, 0.0, -1.0)}
+
+
+@pytest.mark.parametrize(
+    ("at", "seen"),
+    [
+        # A 64th, an eighth and all of the range, both ways.
+        (3300, True), (3100, True), (4000, True), (2400, True), (6400, True), (0, True),
+        (3299, False), (3301, False), (3201, False), (3099, False), (3999, False), (4001, False),
+        (2399, False), (6399, False), (1, False),
+    ],
+)  # fmt: skip
+def test_what_turns_and_turns_back_is_seen_only_where_the_search_looks(at: int, seen: bool) -> None:
+    found = searched(at, Window, Over)
+    assert found.complete
+    assert (found.change.after if found.change else None) == (float(at) if seen else None)
+
+
 # -- several parameters ---------------------------------------------------------------------------
 
 

@@ -449,6 +449,11 @@ def test_sessions_with_one_store_share_results(recording: Path, stages: Path) ->
     assert computed == [{"levels"}, set()]
 
 
+def test_a_stage_to_end_at_must_be_there(recording: Path, stages: Path) -> None:
+    with pytest.raises(UsageError, match=r"--until nothing: no such stage; stages: .*levels"):
+        opened(recording, stages, until="nothing")
+
+
 def test_a_wrong_parameter_is_told_though_its_stage_is_not_run(
     recording: Path, stages: Path
 ) -> None:
