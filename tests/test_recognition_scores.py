@@ -606,6 +606,10 @@ def test_rotation_has_no_truth_for_another_face_a_mirrored_part_or_no_transform(
         normal = turn("x", tilt) @ FACING
         found = rotation_error_deg(placed(normal=normal)[:3, :3], normal, UP, pose)
         assert (found is not None) == known
+    # Its frame is that face's own, and carries the turn.
+    leaned = turn("x", 40) @ FACING
+    found = rotation_error_deg(placed(normal=leaned, turned=-35)[:3, :3], leaned, UP, pose)
+    assert found == (0, pytest.approx(35, abs=1e-6))
     upside_down = turn("x", 180) @ UP
     found = rotation_error_deg(placed(turned=7)[:3, :3], FACING, upside_down, pose)
     assert found == (0, pytest.approx(7, abs=1e-6))
