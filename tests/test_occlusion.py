@@ -63,13 +63,17 @@ def test_the_nearer_region_lies_above_along_every_pixel_of_the_border(
 
 
 @pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize(("gap", "count"), [(0, 15), (1, 15), (2, 15), (3, 0)])
+@pytest.mark.parametrize("label", [(1, 2), (2, 1)])
+@pytest.mark.parametrize("gap", [0, 1, 2, 3, 6])
 def test_a_line_of_up_to_two_pixels_lies_between_two_regions(
-    turned: bool, gap: int, count: int
+    turned: bool, gap: int, label: tuple[int, int]
 ) -> None:
-    labels = halves(gap)
-    found = cover(labels.T.copy() if turned else labels, [0.8, 0.79])
-    assert found.get((1, 2), (0, 0.0))[0] == count
+    """A pixel of no region is in no pair, whatever depth is known of it."""
+    labels = halves(gap, label=label)
+    labels = labels.T.copy() if turned else labels
+    depth = np.where(labels == 1, 0.8, np.where(labels == 2, 0.79, 0.7)).astype(np.float32)
+    found = cover(labels, [0.8, 0.79], depth=depth)
+    assert {pair: count for pair, (count, _) in found.items()} == ({(1, 2): 15} if gap < 3 else {})
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -123,18 +127,37 @@ def test_of_planes_in_parallel_the_step_is_their_distance_however_they_are_tilte
     assert found[1, 2] == (15, pytest.approx(0.006))
 
 
-def test_the_step_is_the_median_of_the_planes_distances_in_the_middle_of_the_border() -> None:
-    """A tilted region meets a level one at the crack between them, column 9.5."""
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("gap", [0, 1, 2])
+def test_planes_are_compared_in_the_middle_between_the_two_pixels(turned: bool, gap: int) -> None:
+    """A tilted region meets a level one; of two pixels that face each other."""
     tilt = np.radians(30.0)
-    tilted = np.array([np.sin(tilt), 0, -np.cos(tilt)])
-    labels = halves(1)
-    points = np.array([[-0.01, 0, 0.78], [0.03, 0, Z_M]])
-    found = cover(labels, points, [tilted, LEVEL])
-    # One column lies between the regions, so the middle of the border is its own, column 10.
-    rx = (10 - CAMERA.cx) / CAMERA.fx
-    slant = abs(tilted @ [rx, 0, 1])
-    step = (Z_M - tilted @ points[0] / (tilted @ [rx, 0, 1])) * min(slant, 1.0)
-    assert found[2, 1] == (15, pytest.approx(step))
+    across = np.array([0, 1.0, 0]) if turned else np.array([1.0, 0, 0])
+    tilted = np.sin(tilt) * across - np.cos(tilt) * np.array([0, 0, 1.0])
+    labels = halves(gap)
+    points = np.array([-0.01 * across + [0, 0, 0.765], [0.03, 0, Z_M]])
+    found = cover(labels.T.copy() if turned else labels, points, [tilted, LEVEL])
+    at = (9 + 10 + gap) / 2
+    ray = np.array([0, (at - CAMERA.cy) / CAMERA.fy, 1.0])
+    ray = ray if turned else np.array([(at - CAMERA.cx) / CAMERA.fx, 0, 1.0])
+    step = (Z_M - tilted @ points[0] / (tilted @ ray)) * min(abs(tilted @ ray), 1.0)
+    assert found[2, 1] == (15, pytest.approx(step, rel=1e-6))
+
+
+def test_the_step_of_two_regions_is_the_median_along_their_border() -> None:
+    """They meet in the rows 0, 1, 2 and 14, and the step grows from row to row."""
+    tilt = np.radians(10.0)
+    tilted = np.array([0, np.sin(tilt), -np.cos(tilt)])
+    labels = halves()
+    labels[3:14, 10:] = 0
+    points = np.array([[0, 0, Z_M], [0, 0, Z_M - 0.03]])
+    ry = (np.array([0.0, 1.0, 2.0, 14.0]) - CAMERA.cy) / CAMERA.fy
+    slant = np.abs(tilted[1] * ry + tilted[2])
+    steps = (Z_M - (tilted @ points[1]) / (tilted[1] * ry + tilted[2])) * np.minimum(slant, 1)
+    count, step = cover(labels, points, [LEVEL, tilted])[1, 2]
+    assert count == 4
+    assert step == pytest.approx(np.median(steps))
+    assert abs(np.median(steps) - np.mean(steps)) > 1e-3
 
 
 @pytest.mark.parametrize("turned", [False, True])
