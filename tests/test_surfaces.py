@@ -451,8 +451,10 @@ def test_surroundings_are_medians() -> None:
     surface = alone()
     rng = np.random.default_rng(0)
     depth = np.where(rng.random((256, 256)) < 0.25, 0.5, Z_M + 0.01).astype(np.float32)
-    below, _ = fall_off(surface, depth)
+    table = Plane(np.array([0, 0, 0.8]), TOWARDS, 0.0, 100)
+    below, above = fall_off(surface, depth, table)
     np.testing.assert_allclose(below, 10.0, atol=1e-3)
+    np.testing.assert_allclose(above, 10.0, atol=1e-3)
 
 
 def test_what_lies_outside_the_image_is_not_measured() -> None:
