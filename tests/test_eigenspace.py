@@ -372,3 +372,10 @@ def test_the_distances_that_are_left_out_are_shares_of_the_norm() -> None:
 def test_symmetry_is_that_of_the_face() -> None:
     views = [face(RECTANGLE, angle) for angle in ANGLES]
     assert build(views, ANGLES, SMALL, SCALE)[0].order == 2
+
+
+def test_unless_told_otherwise_a_space_keeps_98_percent_of_a_set_filled_to_five_degrees(
+    ells: list[Surface],
+) -> None:
+    said = build(ells, ANGLES, SMALL, SCALE, 0.98, 5.0)[0]
+    np.testing.assert_array_equal(build(ells, ANGLES, SMALL, SCALE)[0].manifold, said.manifold)
