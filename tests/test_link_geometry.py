@@ -12,6 +12,7 @@ from skimage.morphology import skeletonize
 from workbench_stages.edges.linking import (
     TERMINATOR_MASKS,
     Step,
+    _corners,
     bresenham,
     link,
     path_offset,
@@ -95,6 +96,15 @@ def test_what_cannot_be_put_together_is_refused() -> None:
             reconstruct(*stack)
     with pytest.raises(ValueError, match="needs the strength"):
         reconstruct(image, image, image, min_weight=0.1)
+
+
+def test_the_steps_have_the_numbers_that_files_hold() -> None:
+    wanted = {
+        "NOTHING": 0, "WEAK": 1, "SHORT_MEDIUM": 2, "SHORT_HIGH": 3, "FAINT_MEDIUM": 4,
+        "FAINT_HIGH": 5, "BACKGROUND": 6, "LOW": 10, "MEDIUM": 11, "HIGH": 12, "LINK": 20,
+        "BORDER": 21, "CREASE": 30, "FOOT": 31,
+    }  # fmt: skip
+    assert {step.name: int(step) for step in Step} == wanted
 
 
 # -- terminators and directions --------------------------------------------------------------------
@@ -495,6 +505,16 @@ def test_what_is_cheaper_goes_before_the_border() -> None:
         assert result.links.border[(result.links.start == [4, 20]).all(axis=1)].tolist() == [border]
 
 
+def test_a_border_as_near_as_an_edge_is_drawn_as_well() -> None:
+    edges = np.zeros((40, 50), bool)
+    edges[20, 5:30] = edges[24, 2] = True
+    result = link(edges, windows=(9.0,), turn=0.0, facing=1.0, corners=0.0, cone_deg=80)
+    mine = (result.links.start == [5, 20]).all(axis=1)
+    assert sorted(result.links.end[mine].tolist()) == [[0, 20], [2, 24]]
+    assert sorted(result.links.border[mine].tolist()) == [False, True]
+    assert result.links.cost[mine].tolist() == [5, 5]
+
+
 # -- evidence --------------------------------------------------------------------------------------
 
 
@@ -587,6 +607,83 @@ def test_a_corner_needs_evidence_for_a_partner_that_does_not_face_it(
     # Without evidence there is none, and nothing is needed where nothing is asked.
     assert not link(edges, **how).edges[60, 62]
     assert link(edges, least_evidence=0.0, **how).edges[60, 62]
+
+
+def plain_corners(edges: np.ndarray, reach: int) -> dict[tuple[int, int], np.ndarray]:
+    """Pixels of lines with two arms at less than 110 degrees, and the bisector away from both.
+
+    Of those within two pixels of each other the sharpest; arms of less than half the reach and
+    hairpins are none.
+    """
+    found: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    for y, x in np.argwhere(edges):
+        around = [(x + dx, y + dy) for dx, dy in RING]
+        around = [
+            (int(u), int(v)) for u, v in around
+            if 0 <= u < edges.shape[1] and 0 <= v < edges.shape[0] and edges[v, u]
+        ]  # fmt: skip
+        if not 2 <= len(around) <= 4:
+            continue
+        arms: list[set[tuple[int, int]]] = []
+        for pixel in around:
+            beside = [a for a in arms if any(max(abs(np.subtract(pixel, q))) == 1 for q in a)]
+            arms = [a for a in arms if a not in beside] + [set().union({pixel}, *beside)]
+        if len(arms) != 2:
+            continue
+        ways = []
+        without = edges.copy()
+        without[y, x] = False
+        for arm in arms:
+            met, front, steps = set(arm), set(arm), 0
+            for _ in range(1, reach):
+                front = {
+                    (u + dx, v + dy)
+                    for u, v in front
+                    for dx, dy in RING
+                    if 0 <= u + dx < edges.shape[1] and 0 <= v + dy < edges.shape[0]
+                    if without[v + dy, u + dx]
+                } - met
+                if not front:
+                    break
+                met |= front
+                steps += 1
+            way = np.array(sorted(met), float).sum(axis=0) - len(met) * np.array([x, y])
+            if steps < reach // 2 or not way.any():
+                break
+            ways.append(way / np.hypot(*way))
+        if len(ways) == 2 and -0.35 < (cosine := float(ways[0] @ ways[1])) <= 0.95:
+            found[int(x), int(y)] = (cosine, -(ways[0] + ways[1]))
+    return {
+        (x, y): way
+        for (x, y), (cosine, way) in found.items()
+        if all(
+            other <= cosine + 1e-6
+            for (u, v), (other, _) in found.items()
+            if abs(u - x) <= 2 and abs(v - y) <= 2
+        )
+    }
+
+
+@pytest.mark.parametrize("reach", [3, 5, 8])
+def test_corners_equal_a_plain_search_on_random_lines(reach: int) -> None:
+    compared = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        edges = skeletonize(rng.random((34, 40)) < 0.5) & (rng.random((34, 40)) < 0.97)
+        wide = np.pad(edges, 1).astype(np.uint8)
+        found = _corners(
+            wide, np.flatnonzero(wide), reach, np.float32(-0.35), np.zeros(wide.shape, np.int32)
+        )
+        wanted = plain_corners(edges, reach)
+        ours = {(int(x) - 1, int(y) - 1): way for x, y, *way in found.tolist()}
+        assert ours.keys() <= wanted.keys()
+        # Of two that are equal but for rounding one may be missing.
+        for x, y in wanted.keys() - ours.keys():
+            assert any(max(abs(u - x), abs(v - y)) <= 2 for u, v in ours)
+        for place, way in ours.items():
+            np.testing.assert_allclose(way, wanted[place], atol=1e-5)
+        compared += len(ours)
+    assert compared > 30
 
 
 # -- refusals --------------------------------------------------------------------------------------
