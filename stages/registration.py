@@ -141,8 +141,9 @@ class Registration(Stage):
         if far_saturated.any():
             moved = warp(far_saturated.astype(np.float32), similarity)
             saturated |= moved > 0.1
-        near = np.nan_to_num(near, copy=False)
-        far = warp(np.nan_to_num(far, copy=False), similarity)
+        # Infinity as well: the greatest float would drown the light of the whole image.
+        near, far = (np.nan_to_num(image, posinf=0, neginf=0) for image in (near, far))
+        far = warp(far, similarity)
 
         gain_drift = 1.0
         if from_optics:
