@@ -30,16 +30,28 @@ from queue import Queue
 
 ROOT = Path(__file__).parents[1]
 
-ROOMS: dict[str, tuple[tuple[str, ...], str]] = {
-    "matching": (("stages/matching/*.py",), "matching"),
-    "edges": (("stages/edges/*.py",), "edges"),
-    "sensor": (("stages/dfd/*.py",), "sensor"),
-    "running": (("workbench/pipeline.py", "workbench/digest.py", "workbench/session.py",
-                 "workbench/settings.py", "workbench/report.py"), "running"),
-    "comparing": (("workbench/comparison.py", "workbench/differences.py"), "comparing"),
-    "sweep": (("workbench/sweep/*.py",), "sweep"),
+_QUICK = "not (slow or process or browser or vulkan)"
+
+ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "matching": (
+        ("stages/matching/*.py",),
+        (f"matching and {_QUICK}", "figures or (matching and slow)"),
+    ),
+    "edges": (("stages/edges/*.py",), (f"edges and {_QUICK}", "figures or (edges and slow)")),
+    "sensor": (("stages/dfd/*.py",), (f"sensor and {_QUICK}", "figures or (sensor and slow)")),
+    "running": (
+        tuple(f"workbench/{name}.py" for name in
+              ("pipeline", "digest", "session", "settings", "report")),
+        (f"pipeline and {_QUICK}", f"(cli or sweep or why) and {_QUICK}"),
+    ),
+    "comparing": (
+        ("workbench/comparison.py", "workbench/differences.py"),
+        (f"why and {_QUICK}", "why and not browser"),
+    ),
+    "sweep": (("workbench/sweep/*.py",), (f"sweep and {_QUICK}", "sweep and not browser")),
 }  # fmt: skip
-"""Room: the files in which faults are put, and the marker of the tests that are run."""
+"""Room: the files in which faults are put, and which tests look at them (markers, see
+``tests/rooms.py``), the quick ones first."""
 
 _SECONDS = 240
 _COMPARISONS = {
@@ -219,15 +231,15 @@ class Copy:
             (self._site / name).symlink_to(self.root / target)
         self._importers = _importers(self.root)
 
-    def test(self, tests: Sequence[str]) -> bool:
-        """Whether the tests pass."""
+    def test(self, tests: str) -> bool:
+        """Whether the tests that a marker expression selects pass."""
         environment = os.environ | {"PYTHONPATH": str(self._site), "PYTHONDONTWRITEBYTECODE": "1"}
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
             environment[name] = "1"
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider"]
         try:
             ended = subprocess.run(
-                [*command, *tests],
+                [*command, "-m", tests],
                 cwd=self.root,
                 env=environment,
                 stdout=subprocess.DEVNULL,
@@ -250,7 +262,7 @@ class Copy:
                 compile(path.read_bytes(), str(path), "exec")
             except SyntaxError:
                 return False
-            return self.test(tests)
+            return all(self.test(selection) for selection in tests)
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
@@ -306,6 +318,22 @@ def drawn(rooms: Sequence[str], sample: int, seed: int) -> list[tuple[str, Fault
     return [every[index] for index in sorted(chosen)]
 
 
+def survivors(file: Path) -> list[tuple[str, Fault]]:
+    """What survived an earlier run, where it stands now."""
+    found = []
+    for fate in json.loads(file.read_text(encoding="utf-8")):
+        alike = [
+            fault
+            for fault in faults_of(ROOT / fate["file"])
+            if (fault.kind, fault.before, fault.text)
+            == (fate["kind"], fate["before"], fate["text"])
+        ]
+        if fate["survived"] and alike:
+            nearest = min(alike, key=lambda fault: abs(fault.line - fate["line"]))
+            found.append((fate["room"], nearest))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--sample", type=int, default=300)
@@ -313,6 +341,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--room", action="append", choices=sorted(ROOMS))
     parser.add_argument("--to", type=Path, help="Write every fault and its fate to this file.")
+    parser.add_argument(
+        "--again", type=Path, help="Only what survived in this file of an earlier run."
+    )
     parser.add_argument("--count", action="store_true", help="Only say how many faults there are.")
     arguments = parser.parse_args()
     rooms = arguments.room or list(ROOMS)
@@ -321,7 +352,11 @@ def main() -> None:
             faults = [f for file in files_of(ROOMS[room][0]) for f in faults_of(file)]
             print(f"{room}: {len(faults)} faults in {len({f.file for f in faults})} files")
         return
-    faults = drawn(rooms, arguments.sample, arguments.seed)
+    if arguments.again is not None:
+        faults = survivors(arguments.again)
+        rooms = sorted({room for room, _ in faults})
+    else:
+        faults = drawn(rooms, arguments.sample, arguments.seed)
     fates: list[dict[str, object]] = []
     with tempfile.TemporaryDirectory(prefix="mutate-") as name:
         copies: Queue[Copy] = Queue()
@@ -333,7 +368,7 @@ def main() -> None:
         def sound(room: str) -> bool:
             copy = copies.get()
             try:
-                return copy.test(ROOMS[room][1])
+                return all(copy.test(selection) for selection in ROOMS[room][1])
             finally:
                 copies.put(copy)
 
