@@ -322,12 +322,9 @@ def survivors(file: Path) -> list[tuple[str, Fault]]:
     """What survived an earlier run, where it stands now."""
     found = []
     for fate in json.loads(file.read_text(encoding="utf-8")):
-        alike = [
-            fault
-            for fault in faults_of(ROOT / fate["file"])
-            if (fault.kind, fault.before, fault.text)
-            == (fate["kind"], fate["before"], fate["text"])
-        ]
+        known = (fate["kind"], fate["before"], fate["text"])
+        faults = faults_of(ROOT / fate["file"])
+        alike = [one for one in faults if (one.kind, one.before, one.text) == known]
         if fate["survived"] and alike:
             nearest = min(alike, key=lambda fault: abs(fault.line - fate["line"]))
             found.append((fate["room"], nearest))
