@@ -132,6 +132,47 @@ def test_a_page_of_numbers_has_b_minus_a_beside_both() -> None:
     assert "| bench | – | x¦y |" in lines
 
 
+class Viewer:
+    """Keeps the numbers that are plotted, by path, frame and stamp."""
+
+    def __init__(self) -> None:
+        self.plotted: dict[str, list[tuple[int, float]]] = {}
+        self.frame = -1
+
+    def set_time(self, timeline: str, **at: Any) -> None:
+        self.frame = at.get("sequence", self.frame)
+
+    def log(self, path: str, entity: Any, static: bool = False) -> None:
+        if type(entity).__name__ == "Scalars":
+            (value,) = entity.scalars.as_arrow_array().to_pylist()
+            self.plotted.setdefault(path, []).append((self.frame, value))
+
+    def send_blueprint(self, blueprint: Any) -> None:
+        pass
+
+
+def test_scores_are_plotted_as_b_minus_a_and_what_differs_in_percent() -> None:
+    from workbench.comparison_view import ComparisonView
+
+    made, viewer = compared(), Viewer()
+    view = ComparisonView(viewer, made)  # type: ignore[arg-type]
+    for frame, a, b, differing in (
+        (5, {"edges/recall": 0.5, "sensor/rms": 1.0}, {"edges/recall": 0.75, "sensor/rms": 1.0}, 1),
+        (6, {"edges/recall": 0.5, "sensor/rms": NAN}, {"edges/recall": 0.25, "sensor/rms": 1.0}, 0),
+        (7, {"edges/recall": 0.5, "sensor/rms": 2.0}, {"edges/recall": 0.5, "sensor/rms": 1.5}, 3),
+        (8, {"sensor/rms": 2.0}, {"edges/recall": 0.5}, 0),
+    ):
+        differences = {"edges": {"mask": Difference("mask", differing, 4)}}
+        made.take(frame, differences, a, b)
+        view.log(frame, 0, differences, {}, a, b)
+    assert viewer.plotted == {
+        "comparison/differing/edges/mask": [(5, 25), (6, 0), (7, 75), (8, 0)],
+        # What has once differed is plotted where it is the same, too.
+        "comparison/scores/edges/recall": [(5, 0.25), (6, -0.25), (7, 0)],
+        "comparison/scores/sensor/rms": [(7, -0.5)],
+    }
+
+
 # -- parameters and what both were made from ------------------------------------------------------
 
 
