@@ -49,7 +49,7 @@ def test_lens_law_is_its_own_inverse() -> None:
         assert object_distance_mm(60, image_distance_mm(60, u)) == pytest.approx(u)
 
 
-def test_metadata_of_a_recording_and_back() -> None:
+def test_a_recordings_rig_and_what_follows_from_it_are_written_as_they_were_recorded() -> None:
     recorded = Recording.open(SCENE).rig
     rig = Rig.from_metadata(recorded)
     assert rig == Rig()
@@ -58,8 +58,85 @@ def test_metadata_of_a_recording_and_back() -> None:
     assert {key: written.get(key) for key in recorded if key != "z_table"} == {
         key: value for key, value in recorded.items() if key != "z_table"
     }
-    again = Rig.from_metadata(written)
-    assert again.to_metadata() == written
+
+
+def test_a_rig_that_shares_no_value_with_the_usual_one_comes_back_from_its_metadata() -> None:
+    rig = Rig(
+        focal_length_mm=35.0,
+        f_number=4.0,
+        pixel_pitch_mm=0.02,
+        near_focus_mm=300.0,
+        sensor_separation_mm=0.6,
+        width_px=320,
+        height_px=200,
+        principal_point_px=(150.5, 98.25),
+        registered=False,
+        far_scale=1.01,
+        far_rotation_deg=0.5,
+        far_shift_px=(1.5, -2.5),
+        vignette_distance_mm=40.0,
+        vignette_radius_mm=13.0,
+        projector=Projector(
+            pattern="dots",
+            lines_per_mm=6.0,
+            angle_deg=12.0,
+            focus_mm=320.0,
+            focal_length_mm=50.0,
+            f_number=5.6,
+            position_mm=(10.0, -60.0, 5.0),
+        ),
+    )
+    usual, usual_projector = Rig(), Projector()
+    assert all(getattr(rig, name) != getattr(usual, name) for name in Rig.model_fields)
+    assert rig.projector is not None
+    assert all(
+        getattr(rig.projector, name) != getattr(usual_projector, name)
+        for name in Projector.model_fields
+    )
+    written = rig.to_metadata()
+    assert Rig.from_metadata(written) == rig
+    assert Rig.from_metadata(written).to_metadata() == written
+    # The record's angle counts clockwise as displayed.
+    assert written["pat_angle"] == "-12.0"
+    without = rig.model_copy(update={"projector": None})
+    assert Rig.from_metadata(without.to_metadata()) == without
+
+
+def test_metadata_says_what_follows_from_the_optics() -> None:
+    """By the lens law: 1/35 = 1/300 + 1/s1, s2 = s1 - 0.6, D = 35/4."""
+    rig = Rig(
+        focal_length_mm=35.0, f_number=4.0, pixel_pitch_mm=0.02, near_focus_mm=300.0,
+        sensor_separation_mm=0.6, width_px=320,
+    )  # fmt: skip
+    written = {key: float(value) for key, value in rig.to_metadata().items()
+               if key not in ("pattern", "proj_pos", "raw_mag")}  # fmt: skip
+    s1 = 1 / (1 / 35 - 1 / 300)
+    s2 = s1 - 0.6
+    u2 = 1 / (1 / 35 - 1 / s2)
+    mean = (s1 + s2) / 2
+    middle = 1 / (1 / 35 - 1 / mean)
+    assert written["D"] == 8.75 and written["pitch_um"] == 20
+    assert (written["s1"], written["s2"]) == pytest.approx((s1, s2), abs=1e-3)
+    assert written["u2"] == pytest.approx(u2, abs=0.05)
+    assert written["depth_span"] == pytest.approx(u2 - 300, abs=0.05)
+    assert written["mag_ratio"] == pytest.approx(s1 / s2, abs=1e-5)
+    # Half of the image's width, by how much the images differ in scale.
+    assert written["edge_shift_px"] == pytest.approx(160 * (s1 / s2 - 1), abs=0.006)
+    assert written["FOV_mid_mm"] == pytest.approx(320 * 0.02 * middle / mean, abs=0.05)
+    blur_mm = 8.75 * (s1 - s2) / s2
+    assert written["coc_at_other_plane_px"] == pytest.approx(blur_mm / 0.02, abs=0.006)
+    assert written["coc_mid_px"] == pytest.approx(8.75 * (s1 / mean - 1) / 0.02, abs=0.006)
+
+
+@pytest.mark.parametrize(("change", "u2"), [({"b": "0.8"}, 806.1), ({"u2": "790.0"}, 790.0)])
+def test_the_far_sensor_is_given_by_its_distance_or_by_what_it_is_focused_on(
+    change: dict[str, str], u2: float
+) -> None:
+    record = {"f": "60", "Fno": "2.8", "p": "0.05", "u1": "700"} | change
+    rig = Rig.from_metadata(record)
+    assert rig.far_focus_mm == pytest.approx(u2, abs=0.05)
+    assert rig.projector is None and (rig.width_px, rig.height_px) == (256, 256)
+    assert Rig.from_metadata(record | {"N": "512"}).height_px == 512
 
 
 def test_toml_and_the_far_focus(tmp_path: Path) -> None:
