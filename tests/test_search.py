@@ -107,6 +107,7 @@ def test_one_parameter_is_tried_further_and_further_and_then_bisected(
     assert (found.verdict, found.change and found.change.verdict) == ("under", "over")
     assert changed(found) == (after, (after - 32) / 64)
     assert (found.runs, found.complete, found.parameters) == (runs, True, 1)
+    assert (found.stage, found.instead) == ("over", None)
     assert found.change is not None and found.change.before == 32.0
 
 

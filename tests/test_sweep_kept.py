@@ -19,6 +19,7 @@ from mcap_fixtures import write_scene
 from workbench.digest import digest_of_code
 from workbench.errors import DataError, UsageError
 from workbench.plugins import find_stages
+from workbench.recording import Recording
 from workbench.session import Options, Session
 from workbench.stage import StageError
 from workbench.sweep import plan, worker
@@ -281,8 +282,6 @@ def test_a_span_that_starts_late_has_these_frames_and_no_others(
 
 
 def _mean(recording: Path, index: int) -> float:
-    from workbench.recording import Recording
-
     [frame] = Recording.open(recording).frames(["near"], [], index, index + 1)
     return float(frame.images["near"].mean())
 
@@ -459,7 +458,7 @@ def test_a_worker_keeps_what_it_opened_for_the_same_job(
     for number in range(3):
         worker.work(replace(job, digest=f"{number}"), task())
         worker.work(replace(job, digest="0"), task())
-    assert len(worker._opened) == 2
+    assert len(opened) == 1 + 3 and len(worker._opened) == 2
     assert [where[0] for where in worker._opened] == ["2", "0"]
 
 
@@ -655,3 +654,173 @@ def test_configurations_are_those_of_this_sweep(
     for cell, path in found.configurations.items():
         settings = resolve(stages_found, None, path)
         assert settings.changed == {"sums.level": 10 + 10 * cell}
+
+
+# -- what is told at the end ----------------------------------------------------------------------
+
+
+def with_figures(plugin: Callable[..., Path], figures: str, compute: str = "") -> Path:
+    """The stages, of which the second says other figures."""
+    source = STAGES.replace('[Score("value", float(artifacts["least"]), better="higher")]', figures)
+    if compute:
+        source = source.replace('return {"least": np.array(-inputs["total"])}', compute)
+    return plugin(source, "toys.py")
+
+
+@pytest.mark.parametrize(
+    ("figures", "compute", "metric", "error", "says"),
+    [
+        ('[Score("value", 1.0)]', "", "least.value", UsageError,
+         "--metric least.value: its stage does not say which way is better; expected "
+         "least.value:higher, :lower or :zero"),
+        ('[Score("value", 1.0)]', "", "least.other", UsageError,
+         "--metric least.other: no such figure; there are: sums.total, least.value"),
+        ("[]", "raise ValueError('dark')", "least.value", DataError,
+         "--metric least.value: no cell has it, for every one failed: least: ValueError: dark"),
+        ("[]", "raise ValueError('dark')", "sums.other", DataError,
+         "--metric sums.other: no cell has it, for every one failed: least: ValueError: dark"),
+    ],
+)  # fmt: skip
+def test_a_figure_to_choose_by_that_there_is_not_is_told(
+    recording: Path, plugin: Callable[..., Path], tmp_path: Path, figures: str, compute: str,
+    metric: str, error: type[Exception], says: str,
+) -> None:  # fmt: skip
+    stages = with_figures(plugin, figures, compute)
+    with pytest.raises(error) as told_of:
+        swept(recording, stages, tmp_path / "out", metrics=[metric])
+    assert str(told_of.value) == says
+    assert not (tmp_path / "out" / sweeping.CELLS_TABLE).exists()
+
+
+def test_a_way_that_is_asked_for_stands_for_one_that_the_stage_does_not_say(
+    recording: Path, plugin: Callable[..., Path], tmp_path: Path
+) -> None:
+    stages = with_figures(plugin, '[Score("value", float(artifacts["least"]))]')
+    found = swept(recording, stages, tmp_path / "out", metrics=["least.value:lower"])
+    assert [choice.row.cell.index for choice in found.choices] == [1]
+    ways = {metric.address: metric.better for metric in found.metrics}
+    assert ways == {"sums.total": "higher", "least.value": "lower"}
+
+
+def test_the_first_figure_makes_the_best_configuration(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    asked = ["least.value", "sums.total"]
+    found = swept(recording, stages, tmp_path / "out", metrics=asked)
+    assert [choice.row.cell.index for choice in found.choices] == [0, 1]
+    assert "level = 10" in (tmp_path / "out" / sweeping.BEST).read_text()
+    reasons = [path.read_text().splitlines()[1] for path in found.configurations.values()]
+    totals = [row.figures["sums.total"] for row in found.rows]
+    figures = [f"least.value = {-t:.6g}, sums.total = {t:.6g}" for t in totals]
+    assert reasons == [
+        f'reason = "the best cell 0 of a sweep: {figures[0]}"',
+        f'reason = "cell 1 of a sweep: {figures[1]}"',
+    ]
+
+
+def test_of_many_cells_the_best_have_configurations(
+    recording: Path, stages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sweeping, "MOST_CONFIGURATIONS", 2)
+    axes = ["sums.level=10,50,30,40,20"]
+    for metrics, kept_cells in ((["least.value"], [0, 4]), (["sums.total"], [1, 3]), ([], [0, 1]),
+                                (["sums.total", "least.value"], [0, 1, 3])):  # fmt: skip
+        found = swept(recording, stages, tmp_path / "out", axes=axes, metrics=metrics)
+        assert sorted(found.configurations) == kept_cells
+        names = sorted(path.stem for path in (tmp_path / "out" / "cells").iterdir())
+        assert names == [f"{cell:04d}" for cell in kept_cells]
+
+
+def test_a_configuration_that_is_the_same_is_not_written_again(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    found = swept(recording, stages, tmp_path / "out", metrics=["sums.total"])
+    paths = [*found.configurations.values(), tmp_path / "out" / sweeping.BEST]
+    before = [path.stat().st_ino for path in paths]
+    swept(recording, stages, tmp_path / "out", metrics=["sums.total"])
+    assert [path.stat().st_ino for path in paths] == before
+    swept(recording, stages, tmp_path / "out", metrics=["least.value"])
+    assert [path.stat().st_ino for path in paths] != before
+
+
+def test_a_sweep_says_where_its_results_come_from(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    other = write_scene(recording.with_name("second.mcap"), frames=range(2))
+    recording.with_name("scale.txt").write_text("2")
+    found = swept(
+        recording, stages, tmp_path / "out", recordings=[recording, other],
+        axes=["sums.level=10,20", "sums.times=1,2"], assignments=["sums.level=7"],
+        metrics=["sums.total"],
+    ).provenance  # fmt: skip
+    session = Session.open(
+        Options(recording, plugins=[stages], until="least", assignments=["sums.level=7"])
+    )
+    plain = session.provenance()
+    assert found["recordings"] == [
+        {
+            "name": path.name,
+            "digest": Recording.open(path).digest,
+            "resources": plain["resources"],
+        }
+        for path in (recording, other)
+    ]
+    assert found["sweep"] == {
+        "axes": {"sums.level": [10, 20], "sums.times": [1, 2]},
+        "zipped": [],
+        "cells": 4,
+        "of": 4,
+        "seed": None,
+        "metrics": ["sums.total"],
+    }
+    for name in ("bench", "code", "libraries", "parameters", "preset", "changed", "frames", "until",
+                 "topics", "python"):  # fmt: skip
+        assert found[name] == plain[name], name
+    assert "recording" not in found and "resources" not in found
+
+
+def test_a_sample_of_zipped_axes_says_so(recording: Path, stages: Path, tmp_path: Path) -> None:
+    options = Options(recording, plugins=[stages], until="sums")
+    request = Request(
+        options, [recording], tmp_path / "out",
+        ["sums.level=10,20,30", "sums.times=1,2,3"], ["sums.level,sums.times"], 2, 5,
+        workers=1, pictures=0,
+    )  # fmt: skip
+    found = sweeping.run(request)
+    told_of = found.provenance["sweep"]
+    assert told_of["zipped"] == [["sums.level", "sums.times"]]
+    assert (told_of["cells"], told_of["of"], told_of["seed"]) == (2, 3, 5)
+    assert len(found.rows) == 2 and {len(row.cell.values) for row in found.rows} == {2}
+
+
+def test_progress_is_told_from_what_was_kept_to_all_of_it(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    swept(recording, stages, tmp_path / "out", frames=(0, 1))
+    reached: list[tuple[int, int]] = []
+    finished: list[Any] = []
+    options = Options(recording, plugins=[stages], until="least")
+    request = Request(
+        options, [recording], tmp_path / "out", ["sums.level=10,20"], workers=1, pictures=0
+    )
+
+    def finish(sweep: Sweep, cache: Cache) -> None:
+        finished.append(sweep)
+        assert cache.readable(sweep.job.sources[0]) == {0, 1, 2}
+
+    found = sweeping.run(request, lambda done, total: reached.append((done, total)), finish)
+    assert reached == [(2, 6), (4, 6), (6, 6)]
+    assert finished == [found] and found.spent.tasks == 2
+    assert 0 < found.spent.stages < found.spent.workers <= found.spent.total
+    assert 0 < found.spent.computing <= found.spent.total
+
+
+def test_cells_with_the_same_results_have_the_same_digest_and_others_another(
+    recording: Path, stages: Path, tmp_path: Path
+) -> None:
+    cells = [row.digest for row in swept(recording, stages, tmp_path / "out").rows]
+    again = [row.digest for row in swept(recording, stages, tmp_path / "other").rows]
+    assert cells == again and len(set(cells)) == 2
+    recording.with_name("scale.txt").write_text("2")
+    other = [row.digest for row in swept(recording, stages, tmp_path / "out").rows]
+    assert not set(other) & set(cells)
