@@ -465,6 +465,31 @@ def test_focus_maps_are_taken_over_the_window_with_the_calibrations_noise(
     assert not np.array_equal(other["focus_near"], out["focus_near"])
 
 
+def measured(near: np.ndarray, far: np.ndarray, **changes: Any) -> dict[str, Any]:
+    """Focus maps and depth of two registered images."""
+    inputs = given(near=near.astype(np.float32), far=far.astype(np.float32)) | changes
+    inputs |= FocusMaps().compute(inputs, FocusMaps.Parameters())
+    return run(inputs) | inputs
+
+
+def test_exposure_does_not_change_the_depth_nor_does_an_offset_the_focus() -> None:
+    """Twice or a third of the light in both images; a black level that is not subtracted."""
+    stripes = np.sin(2 * np.pi * np.arange(SHAPE[1]) / 5)[None].repeat(SHAPE[0], 0)
+    near, far = 100 + 60 * stripes, 100 + 25 * stripes
+    base = measured(near, far)
+    np.testing.assert_allclose(base["depth_relative"][9:-9, 9:-9], 0.5 - 35 / 85 / 2, atol=3e-3)
+    for exposure in (2.0, 1 / 3):
+        brighter = measured(exposure * near, exposure * far)
+        np.testing.assert_allclose(brighter["focus_near"], exposure * base["focus_near"], rtol=1e-4)
+        np.testing.assert_allclose(brighter["depth_relative"], base["depth_relative"], atol=1e-4)
+    lifted = measured(near + 40, far + 40)
+    for name in ("focus_near", "focus_far"):
+        np.testing.assert_allclose(lifted[name], base[name], rtol=1e-3)
+    # Less light on one sensor alone is read as blur.
+    darker = measured(near, 0.9 * far)
+    assert (darker["depth_relative"] < base["depth_relative"] - 0.01)[9:-9, 9:-9].all()
+
+
 # -- the stage registration ------------------------------------------------------------------------
 
 
