@@ -26,6 +26,7 @@ from workbench_stages.dfd.focus import PAPER_KERNEL, SensorNoise, focus_map, lap
 from workbench_stages.dfd.images import full_scale, grey
 from workbench_stages.dfd.similarity import Similarity, warp_to_near
 from workbench_stages.dfd.stripes import Stripes, whole_period_taps
+from workbench_stages.dfd.texture import Texture
 from workbench_stages.focus_maps import FocusMaps, window_side_px
 from workbench_stages.registration import Registration
 
@@ -328,6 +329,35 @@ def test_three_percent_of_a_neighbourhood_may_be_saturated(pixels: int, known: b
     assert np.isfinite(out["depth_m"][30, 46]) and np.isfinite(out["depth_m"][36, 40])
     if not known:
         assert np.isnan(out["depth_m"]).sum() == 7 * 6
+
+
+@pytest.mark.parametrize(("pixels", "known"), [(2, True), (3, False)])
+def test_without_stripes_the_windows_are_those_of_a_period_of_seven_pixels(
+    pixels: int, known: bool
+) -> None:
+    """Nine pixels a side: two of 81 are two and a half percent, three nearly four."""
+    saturated = np.zeros(SHAPE, bool)
+    saturated[30, 40 : 40 + pixels] = True
+    out = run(given(0.2, saturated=saturated, stripes=None))
+    assert np.isnan(out["depth_m"]).sum() == (0 if known else 9 * 7)
+
+
+def test_what_is_measured_on_shrunk_images_has_as_many_samples_as_they_have() -> None:
+    """The window grows with the scale, its independent samples do not; half confidence is other."""
+    noise = SensorNoise(90.0, 0.0)
+    confidences = []
+    for scale_px in (1, 2):
+        curve = np.array([0.5, -0.5], np.float32).reshape(2, 1, 1)
+        made = calibration(texture=Texture(3.0 * scale_px, scale_px, 1.0), curve=curve)
+        out = run(
+            given(0.2, calibration=made, focus_noise=noise, stripes=None),
+            texture_half_confidence_error_percent=12.0, half_confidence_error_percent=3.0,
+        )  # fmt: skip
+        confidences.append(float(out["confidence"][30, 40]))
+    assert confidences[0] == pytest.approx(confidences[1], rel=1e-4)
+    striped = run(given(0.2, focus_noise=noise, stripes=None), half_confidence_error_percent=12.0)
+    assert striped["confidence"][30, 40] == pytest.approx(confidences[0], rel=1e-4)
+    assert 0.01 < confidences[0] < 0.99
 
 
 @pytest.mark.parametrize(("least", "known"), [(0.85, True), (0.95, False)])
