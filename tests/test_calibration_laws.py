@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,10 @@ from textures import write_rig
 from thin_lens import Rig as Sensor
 from thin_lens import frame, passes, planes
 
+from workbench.pipeline import Pipeline
+from workbench.plugins import find_stages
 from workbench.recording import Frame
+from workbench.settings import resolve
 from workbench_stages.dfd import from_optics as from_optics_module
 from workbench_stages.dfd import procedure
 from workbench_stages.dfd.calibration import Calibration
@@ -334,35 +338,49 @@ def test_the_middle_is_the_32_pixels_about_it() -> None:
 # -- the whole procedure ---------------------------------------------------------------------------
 
 
-def cropped(frames: list[Frame], rows: slice) -> list[Frame]:
-    """Frames that are wider than they are high."""
+def cropped(frames: list[Frame], rows: slice, columns: slice) -> list[Frame]:
+    """Frames that are not square; the principal point is no longer in the middle."""
     for one in frames:
         for channel, image in one.images.items():
-            one.images[channel] = np.ascontiguousarray(image[rows])
-        object.__setattr__(one.truth, "depth_m", one.truth.depth_m[rows])  # type: ignore[union-attr]
+            one.images[channel] = np.ascontiguousarray(image[rows, columns])
+        assert one.truth is not None and one.truth.depth_m is not None
+        object.__setattr__(one.truth, "depth_m", one.truth.depth_m[rows, columns])
+        height, width = one.images["near"].shape
+        matrix = one.cameras["near"].K - [[0, 0, columns.start], [0, 0, rows.start], [0, 0, 0]]
+        one.cameras["near"] = replace(one.cameras["near"], width=width, height=height, K=matrix)
     return frames
 
 
-def test_a_wide_image_is_calibrated_pixel_by_pixel() -> None:
-    """Not square, the far sensor darker, planes at both ends a little beyond the focal planes."""
-    sensor = Sensor(size_px=128, far_gain=0.8)
+@pytest.mark.parametrize("level", [False, True])
+def test_an_image_that_is_not_square_is_calibrated_and_measured(
+    level: bool, tmp_path: Path
+) -> None:
+    """Upright stripes in a wide image, level ones in a tall one; the far sensor is darker."""
+    sensor = Sensor(size_px=128, far_gain=0.8, angle_deg=90.0 if level else 0.0)
+    part = slice(8, 104), slice(0, 128)
+    cut = part[::-1] if level else part
+    shape = (128, 96) if level else (96, 128)
     near_mm, far_mm = sensor.near_focus_mm, sensor.far_focus_mm
-    frames = cropped(planes(sensor, np.linspace(near_mm - 2, far_mm + 2, 9)), slice(20, 116))
+    # Two per cent of the range on either side are used as well, and no more.
+    inner = np.linspace(near_mm - 2, far_mm + 2, 9)
+    frames = cropped(planes(sensor, np.array([near_mm - 4, *inner, far_mm + 4])), *cut)
     found = calibrate(
         passes(frames), {"u1": str(near_mm), "u2": str(far_mm)}, CalibrateParameters(degree=3)
     )
-    assert found.curve.shape == (4, 96, 128)
-    assert (found.similarity.width, found.similarity.height) == (128, 96)
+    assert found.curve.shape == (4, *shape)
+    assert (found.similarity.height, found.similarity.width) == shape
     assert (found.near_z_m, found.far_z_m) == pytest.approx((near_mm / 1e3, far_mm / 1e3))
-    assert found.gain_map.shape == (96, 128)
+    assert found.gain_map.shape == shape
     assert found.gain_map.mean() == pytest.approx(1 / 0.8, rel=0.01)
     assert found.full_scale == 255
     assert found.noise.gain == pytest.approx(255 / sensor.full_well, rel=0.2)
     report = found.report
     assert report["degree"] == 3
-    assert report["planes"] == report["planes_used"] == 18
-    assert report["distances"] == 9
+    assert (report["planes"], report["planes_used"], report["distances"]) == (22, 18, 9)
+    assert report["gain_spread_percent"] < 2
+    assert report["gain_near_over_far"] == pytest.approx(1 / 0.8, rel=0.01)
     assert report["stripe_period_px"] == pytest.approx(5, rel=0.01)
+    assert abs(report["stripe_direction_deg"]) == pytest.approx(sensor.angle_deg, abs=0.5)
     assert report["working_range_mm"] == pytest.approx([near_mm, far_mm])
     assert report["noise_source"] == "repeated shots of planes"
     stand_off_mm, span_mm = (near_mm + far_mm) / 2, far_mm - near_mm
@@ -370,10 +388,101 @@ def test_a_wide_image_is_calibrated_pixel_by_pixel() -> None:
         share = 100 * report["held_out_worst_mm"] / whole
         assert report[f"held_out_worst_percent_of_{name}"] == pytest.approx(share)
     # The curve takes a nearer surface to a smaller relative depth, and falls with the ratio.
-    ends = procedure._evaluate(found.curve, np.full((96, 128), 0.5, np.float32))
-    other = procedure._evaluate(found.curve, np.full((96, 128), -0.5, np.float32))
+    ends = procedure._evaluate(found.curve, np.full(shape, 0.5, np.float32))
+    other = procedure._evaluate(found.curve, np.full(shape, -0.5, np.float32))
     assert (ends < 0.5).all() and (other > 0.5).all()
     assert json.loads(json.dumps(report)) == report
+
+    found.save(tmp_path / "calibration.npz")
+    stages = find_stages()
+    resources = {"calibration": tmp_path / "calibration.npz"}
+    pipeline = Pipeline(stages, resolve(stages), resources, until="depth_cloud")
+    (seen,) = cropped([frame(sensor, 0, 741.0, np.random.default_rng(9))], *cut)
+    run = pipeline.run(seen)
+    assert not run.failures and not run.warnings
+    depth_m, points = run.artifacts["depth_m"], run.artifacts["cloud_xyz_m"]
+    middle = depth_m[16:-16, 16:-16]
+    assert np.isfinite(middle).mean() > 0.98
+    assert 1e3 * np.nanmean(middle) == pytest.approx(741, abs=0.5)
+    assert float(np.nanstd(1e3 * middle)) < 0.012 * span_mm
+    y, x = np.nonzero(np.isfinite(depth_m))
+    K = seen.cameras["near"].K
+    assert K[0, 2] != K[1, 2]
+    np.testing.assert_allclose(points[:, 0], (x - K[0, 2]) / K[0, 0] * points[:, 2], rtol=1e-4)
+    np.testing.assert_allclose(points[:, 1], (y - K[1, 2]) / K[1, 1] * points[:, 2], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("held_out", "degree"),
+    [
+        ({3: 1.04, 4: 1.029, 5: 1.0, 6: 1.2}, 4), ({3: 1.0, 4: 0.98, 5: 1.1, 6: 1.2}, 3),
+        ({3: 2.0, 4: 1.5, 5: 1.2, 6: 1.0}, 6),
+    ],
+)  # fmt: skip
+def test_the_lowest_degree_is_taken_that_is_as_good_as_the_best(
+    held_out: dict[int, float], degree: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within three per cent of the best on planes held out, of twelve bits and nine distances."""
+    asked = []
+
+    def planted(_: Any, tried: int, neighbourhood_px: int) -> tuple[float, float]:
+        asked.append((tried, neighbourhood_px))
+        return 1e-3 * held_out[tried], 3e-3 * held_out[tried]
+
+    monkeypatch.setattr(procedure, "_held_out", planted)
+    sensor = Sensor(size_px=64, bits=12)
+    near_mm, far_mm = sensor.near_focus_mm, sensor.far_focus_mm
+    found = calibrate(
+        passes(planes(sensor, np.linspace(near_mm, far_mm, 9), shots=1)),
+        {"u1": str(near_mm), "u2": str(far_mm)},
+        CalibrateParameters(neighbourhood_px=5),
+    )
+    assert sorted(asked) == [(3, 5), (4, 5), (5, 5), (6, 5)]
+    assert found.report["degree"] == degree == len(found.curve) - 1
+    span_mm = far_mm - near_mm
+    assert found.report["held_out_rms_mm"] == pytest.approx(
+        1e-3 * held_out[degree] * span_mm, rel=1e-3
+    )
+    assert found.report["held_out_worst_mm"] == pytest.approx(
+        3e-3 * held_out[degree] * span_mm, rel=1e-3
+    )
+    assert found.full_scale == 4095
+    assert found.report["noise_source"] == "single shots of planes, along the stripes"
+    assert found.noise.gain == pytest.approx(4095 / sensor.full_well, rel=0.3)
+
+
+def test_dot_grids_set_the_map_where_the_recording_has_some() -> None:
+    import cv2
+
+    sensor = Sensor(size_px=128)
+    near_mm, far_mm = sensor.near_focus_mm, sensor.far_focus_mm
+    true = Similarity(0.985, 0.0, 1.2, -0.7, 128, 128)
+    y, x = np.mgrid[0:128, 0:128].astype(float)
+    near = 30 + 150 * np.exp(-(((x % 16) - 8.0) ** 2 + ((y % 16) - 8.0) ** 2) / 8)
+    far = cv2.warpAffine(
+        near, cv2.invertAffineTransform(true.far_from_near), (128, 128),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+    )  # fmt: skip
+    grid = planes(sensor, np.array([750.0]), shots=1)[0]
+    grid.images.update(near=near.astype(np.uint8), far=far.clip(0, 255).astype(np.uint8))
+    assert grid.truth is not None
+    grid.truth.meta["kind"] = "grid"
+    frames = planes(sensor, np.linspace(near_mm, far_mm, 6), shots=1)
+    found = calibrate(
+        passes([*frames, grid]), {"u1": str(near_mm), "u2": str(far_mm)}, CalibrateParameters()
+    )
+    assert found.similarity.scale == pytest.approx(0.985, abs=5e-4)
+    shift = found.similarity.dx_px, found.similarity.dy_px
+    assert shift == pytest.approx((1.2, -0.7), abs=0.03)
+    registration = found.report["registration"]
+    assert registration["from"].startswith("1 dot grids, ")
+    assert registration["scale"] == found.similarity.scale
+    assert registration["residual_rms_px"] < 0.1 < registration["before_rms_px"]
+    assert registration["residual_each_px"] == pytest.approx(
+        [registration["residual_rms_px"]], rel=0.1
+    )
+    # The grid is no plane to fit.
+    assert found.report["planes"] == 6
 
 
 def test_frames_of_unlike_size_are_refused_with_their_number() -> None:

@@ -686,6 +686,24 @@ def test_corners_equal_a_plain_search_on_random_lines(reach: int) -> None:
     assert compared > 30
 
 
+def test_no_corner_of_many_is_lost() -> None:
+    """More than the search has room for at first, all alike."""
+    edges = np.zeros((512, 420), bool)
+    x = np.arange(420)
+    for top in range(10, 500, 14):
+        edges[top + np.abs((x % 20) - 10), x] = True
+    wide = np.pad(edges, 1).astype(np.uint8)
+    found = _corners(
+        wide, np.flatnonzero(wide), 5, np.float32(-0.35), np.zeros(wide.shape, np.int32)
+    )
+    # Two a period of twenty pixels in each of 35 rows, but for those at the ends.
+    places = {(int(u) - 1, int(v) - 1) for u, v, *_ in found.tolist()}
+    wanted = {(u, top + abs(u % 20 - 10)) for top in range(10, 500, 14) for u in range(10, 420, 10)}
+    assert len(wanted) > 1000
+    assert wanted - places == set()
+    assert len(places - wanted) <= 2 * 35
+
+
 # -- refusals --------------------------------------------------------------------------------------
 
 

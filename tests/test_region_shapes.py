@@ -108,6 +108,14 @@ def test_a_rectangle(height: int, width: int, place: tuple[int, int]) -> None:
     assert min(height, width) < 4 or table.perimeter_px[0] > exact - 4 * 1.2
 
 
+def test_a_region_that_fills_the_image_ends_at_its_borders() -> None:
+    """One border's pixels are no neighbours of the other's."""
+    table = region_features(np.ones((24, 41), np.int32))
+    assert table.perimeter_px[0] == pytest.approx(2 * (24 + 41), abs=5)
+    assert table.border_px.tolist() == [2 * (24 + 41) - 4]
+    assert table.greatest_distance_px[0] == pytest.approx(np.hypot(20.5, 11.5))
+
+
 def test_an_l_has_its_centroid_outside_of_its_arms_middle() -> None:
     """Two arms of 40 by 10 that share a corner: areas and moments add."""
     labels = block((60, 60), (5, 45, 8, 18))

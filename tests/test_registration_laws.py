@@ -8,6 +8,7 @@ import pytest
 
 from workbench_stages.dfd.similarity import (
     Similarity,
+    _agreement,
     align_pair,
     find_dots,
     fit_similarity,
@@ -348,6 +349,38 @@ def test_dots_that_are_cut_or_of_an_odd_size_are_left_out() -> None:
     assert np.linalg.norm(found[:, None] - centres[None], axis=2).min(axis=1).max() < 0.05
 
 
+def test_one_dot_is_a_dot_and_ones_of_twice_the_area_or_half_of_it_are_too() -> None:
+    """Left out are those of less than two fifths or more than five halves of the usual area."""
+    assert find_dots(lattice(np.array([[20.3, 14.6]]), (30, 44))) == pytest.approx(
+        np.array([[20.3, 14.6]]), abs=0.05
+    )
+    grid = np.zeros((64, 120))
+    for row in range(4):
+        for column in range(7):
+            grid[8 + 14 * row : 12 + 14 * row, 8 + 15 * column : 12 + 15 * column] = 100
+    for height, width, found in ((1, 7, True), (2, 3, False), (5, 8, True), (6, 7, False)):
+        image = grid.copy()
+        image[22:26, 38:42] = 0
+        image[22 : 22 + height, 38 : 38 + width] = 100
+        assert len(find_dots(image)) == 28 - (not found)
+
+
+def test_agreement_is_a_correlation_where_both_images_have_pixels() -> None:
+    image = cv2.GaussianBlur(
+        np.random.default_rng(0).normal(size=(80, 120)).astype(np.float32), (0, 0), 1.5
+    )
+    here = Similarity.identity(120, 80)
+    assert _agreement(image, image, here) == pytest.approx(1, abs=1e-5)
+    assert _agreement(image, 5 * image + 3, here) == pytest.approx(1, abs=1e-3)
+    assert _agreement(image, -image, here) == pytest.approx(-1, abs=1e-5)
+    assert abs(_agreement(image, image[::-1, ::-1], here)) < 0.3
+    moved_ = Similarity(1.0, 0.0, 6.0, 0.0, 120, 80)
+    assert _agreement(warp_to_near(image, moved_), image, moved_) > 0.98
+    # Three quarters of the image out of sight.
+    assert _agreement(image, image, Similarity(1.0, 0.0, 92.0, 0.0, 120, 80)) == -1
+    assert _agreement(image * 0, image, here) == -1
+
+
 @pytest.mark.parametrize("image", [np.zeros((40, 40)), np.full((40, 40), -3.0), np.ones((40, 40))])
 def test_no_dots_are_none(image: np.ndarray) -> None:
     assert find_dots(image).shape == (0, 2)
@@ -362,6 +395,7 @@ def test_pairs_are_matched_over_a_drift_and_each_with_its_own() -> None:
     a, b = match_dots(near[1:], np.concatenate([far[order], [[70.0, 4.0]]]))
     assert len(a) == len(near) - 1
     np.testing.assert_allclose(b, moved(true, a), atol=1e-9)
+    assert len(match_dots(near[[0, 7, 40, 47]], far[[0, 7, 40, 47]])[0]) == 4
     for few in (near[:3], near[:0]):
         assert len(match_dots(few, far)[0]) == len(match_dots(near, few)[0]) == 0
 

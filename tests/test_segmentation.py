@@ -351,3 +351,39 @@ def test_the_stage_of_the_stack_takes_the_full_scale_of_the_sensor(top: float) -
     assert out["gradient"].max() == pytest.approx(40 * scale, rel=1e-3)
     for name in ("edges_low", "edges_medium", "edges_high"):
         assert out[name] is getattr(out["edge_choice"], name)
+
+
+def test_the_stage_of_linking_looks_as_far_as_it_is_told() -> None:
+    image = lines((20, 4, 20, 100), (20, 27, 40, 100))
+    given = stacked(image)
+    for reach, found in ((8.0, True), (7.0, False)):
+        inputs = {"edge_choice": given, "depth_m": None, "depth_relative": None}
+        parameters = LinkedEdges.Parameters(reach=reach, border=False, use_evidence=False)
+        out = LinkedEdges().compute(inputs, parameters)
+        assert bool(out["edges_linked"][20:27, 20].all()) == found
+        np.testing.assert_array_equal(out["links"], out["edges_linked"] & (image == 9))
+        np.testing.assert_array_equal(out["edges_reconstructed"], image != 9)
+        assert len(out["terminators"]) == len(out["terminator_directions"]) == 4
+
+
+def test_relative_depth_gives_regions_no_planes() -> None:
+    """Without metres there is no elevation, however well the relative depth is known."""
+    image = lines((45, 0, 64, 100))
+    done = linked(stacked(image))
+    inputs: dict[str, Any] = {
+        "region_lines": done.lines, "intensity": image, "edge_choice": stacked(image),
+        "linking": done, "depth_m": None, "depth_relative": np.full(SHAPE, 0.4, np.float32),
+        "near_camera": None,
+    }  # fmt: skip
+    regions = RegionFeatures().compute(inputs, RegionFeatures.Parameters())["regions"]
+    assert len(regions) == 2
+    assert np.isnan(regions["elevation_m"]).all() and (regions["plane_px"] == 0).all()
+
+    class Seen:
+        width, height, K = SHAPE[1], SHAPE[0], np.diag([900.0, 900.0, 1.0])
+
+    metric = inputs | {"depth_m": np.full(SHAPE, 0.7, np.float32), "near_camera": Seen()}
+    regions = RegionFeatures().compute(metric, RegionFeatures.Parameters(inset=3.0))["regions"]
+    assert np.isfinite(regions["elevation_m"]).all()
+    small = RegionFeatures().compute(metric, RegionFeatures.Parameters(inset=9.0))["regions"]
+    assert (small["plane_px"] < regions["plane_px"]).all()

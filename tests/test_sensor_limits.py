@@ -26,6 +26,7 @@ from workbench_stages.dfd.focus import PAPER_KERNEL, SensorNoise, focus_map, lap
 from workbench_stages.dfd.images import full_scale, grey
 from workbench_stages.dfd.similarity import Similarity, warp_to_near
 from workbench_stages.dfd.stripes import Stripes, whole_period_taps
+from workbench_stages.dfd.texture import Texture
 from workbench_stages.focus_maps import FocusMaps, window_side_px
 from workbench_stages.registration import Registration
 
@@ -330,6 +331,35 @@ def test_three_percent_of_a_neighbourhood_may_be_saturated(pixels: int, known: b
         assert np.isnan(out["depth_m"]).sum() == 7 * 6
 
 
+@pytest.mark.parametrize(("pixels", "known"), [(2, True), (3, False)])
+def test_without_stripes_the_windows_are_those_of_a_period_of_seven_pixels(
+    pixels: int, known: bool
+) -> None:
+    """Nine pixels a side: two of 81 are two and a half percent, three nearly four."""
+    saturated = np.zeros(SHAPE, bool)
+    saturated[30, 40 : 40 + pixels] = True
+    out = run(given(0.2, saturated=saturated, stripes=None))
+    assert np.isnan(out["depth_m"]).sum() == (0 if known else 9 * 7)
+
+
+def test_what_is_measured_on_shrunk_images_has_as_many_samples_as_they_have() -> None:
+    """The window grows with the scale, its independent samples do not; half confidence is other."""
+    noise = SensorNoise(90.0, 0.0)
+    confidences = []
+    for scale_px in (1, 2):
+        curve = np.array([0.5, -0.5], np.float32).reshape(2, 1, 1)
+        made = calibration(texture=Texture(3.0 * scale_px, scale_px, 1.0), curve=curve)
+        out = run(
+            given(0.2, calibration=made, focus_noise=noise, stripes=None),
+            texture_half_confidence_error_percent=12.0, half_confidence_error_percent=3.0,
+        )  # fmt: skip
+        confidences.append(float(out["confidence"][30, 40]))
+    assert confidences[0] == pytest.approx(confidences[1], rel=1e-4)
+    striped = run(given(0.2, focus_noise=noise, stripes=None), half_confidence_error_percent=12.0)
+    assert striped["confidence"][30, 40] == pytest.approx(confidences[0], rel=1e-4)
+    assert 0.01 < confidences[0] < 0.99
+
+
 @pytest.mark.parametrize(("least", "known"), [(0.85, True), (0.95, False)])
 def test_folded_depth_is_unknown_and_has_no_confidence(least: float, known: bool) -> None:
     """Nine tenths of the calibrated contrast: 0.1 of near and far together."""
@@ -463,6 +493,31 @@ def test_focus_maps_are_taken_over_the_window_with_the_calibrations_noise(
     other = FocusMaps().compute(inputs, FocusMaps.Parameters(laplacian="paper"))
     assert "the calibration was made with opencv" in other[WARNINGS][0]
     assert not np.array_equal(other["focus_near"], out["focus_near"])
+
+
+def measured(near: np.ndarray, far: np.ndarray, **changes: Any) -> dict[str, Any]:
+    """Focus maps and depth of two registered images."""
+    inputs = given(near=near.astype(np.float32), far=far.astype(np.float32)) | changes
+    inputs |= FocusMaps().compute(inputs, FocusMaps.Parameters())
+    return run(inputs) | inputs
+
+
+def test_exposure_does_not_change_the_depth_nor_does_an_offset_the_focus() -> None:
+    """Twice or a third of the light in both images; a black level that is not subtracted."""
+    stripes = np.sin(2 * np.pi * np.arange(SHAPE[1]) / 5)[None].repeat(SHAPE[0], 0)
+    near, far = 100 + 60 * stripes, 100 + 25 * stripes
+    base = measured(near, far)
+    np.testing.assert_allclose(base["depth_relative"][9:-9, 9:-9], 0.5 - 35 / 85 / 2, atol=3e-3)
+    for exposure in (2.0, 1 / 3):
+        brighter = measured(exposure * near, exposure * far)
+        np.testing.assert_allclose(brighter["focus_near"], exposure * base["focus_near"], rtol=1e-4)
+        np.testing.assert_allclose(brighter["depth_relative"], base["depth_relative"], atol=1e-4)
+    lifted = measured(near + 40, far + 40)
+    for name in ("focus_near", "focus_far"):
+        np.testing.assert_allclose(lifted[name], base[name], rtol=1e-3)
+    # Less light on one sensor alone is read as blur.
+    darker = measured(near, 0.9 * far)
+    assert (darker["depth_relative"] < base["depth_relative"] - 0.01)[9:-9, 9:-9].all()
 
 
 # -- the stage registration ------------------------------------------------------------------------
