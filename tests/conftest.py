@@ -300,11 +300,12 @@ def twins(tmp_path_factory: pytest.TempPathFactory, first_frames: list[Frame]) -
 def long_recordings(
     tmp_path_factory: pytest.TempPathFactory, first_frames: list[Frame]
 ) -> dict[int, Path]:
-    """The same images as a short and as a long recording, by the number of frames."""
+    """The same images as recordings of different lengths, by the number of frames."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "calibration.npz").write_bytes(CALIBRATION.read_bytes())
     return {
-        count: write_again(folder / f"long{count}.mcap", first_frames, count) for count in (20, 120)
+        count: write_again(folder / f"long{count}.mcap", first_frames, count)
+        for count in (20, 60, 120)
     }
 
 
