@@ -216,6 +216,20 @@ def test_rotation_is_told_within_the_parts_period(database: Database, rotation: 
     )
 
 
+def test_a_turn_beyond_the_period_is_told_within_it(database: Database) -> None:
+    """The manifold has it at 250°; a part that is the same after half a turn is turned by 70°."""
+    slanted, ell, plate = database.parts
+    twice = replace(database, parts=(slanted, replace(ell, period_deg=180.0), plate))
+    scene = Scene()
+    label = scene.add(ELL, 250.0)
+    pose, surface = posed(twice, scene, label, "ell")
+    assert pose["rotation_deg"] == pytest.approx(70, abs=0.7)
+    np.testing.assert_allclose(
+        pose["camera_from_surface"],
+        camera_from_surface(surface.origin_m, surface.normal, pose["rotation_deg"]),
+    )
+
+
 @pytest.mark.parametrize(("tilt", "towards"), [(0.0, 0.0), (25.0, 40.0), (40.0, 250.0)])
 def test_the_gripper_comes_along_the_inward_normal_to_the_centroid(
     database: Database, tilt: float, towards: float
