@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from face_scenes import ELL, RECTANGLE, Scene, face, views_of
+from face_scenes import ELL, RECTANGLE, Scene, face, plate_and_ell
 
 from workbench_stages.edges.planes import Camera
-from workbench_stages.matching.database import Database, Part, make_database
+from workbench_stages.matching.database import Database, Part
 from workbench_stages.matching.recognise import (
     Reason,
     Rules,
@@ -25,12 +25,10 @@ from workbench_stages.matching.recognise import (
 )
 from workbench_stages.matching.surfaces import Surface, cut_out, features_mm
 
-STEP_DEG = 30.0
-
 
 @pytest.fixture(scope="module")
 def database() -> Database:
-    return make_database({"plate": views_of(RECTANGLE, STEP_DEG), "ell": views_of(ELL, STEP_DEG)})
+    return plate_and_ell()
 
 
 class Lone:
@@ -194,9 +192,9 @@ def test_a_face_that_is_not_flat_is_refused(
     assert Reason(plate.judge(database)["reason"]) is reason
 
 
-@pytest.mark.parametrize("over", [True, False])
+@pytest.mark.parametrize(("by", "over"), [(-1e-9, True), (0.0, False), (1e-9, False)])
 def test_a_region_counts_as_covered_over_its_share_of_the_border(
-    database: Database, over: bool
+    database: Database, by: float, over: bool
 ) -> None:
     """The share is the border pixels that say so over the region's own perimeter, in pixels."""
     scene = Scene()
@@ -209,7 +207,7 @@ def test_a_region_counts_as_covered_over_its_share_of_the_border(
         for a, b in ((scene.labels[:-1], scene.labels[1:]), (scene.labels[1:], scene.labels[:-1]))
     )
     share = (len(rows) + columns) / regions[low - 1]["perimeter_px"]
-    limit = share * (1 - 1e-9) if over else share * (1 + 1e-9)
+    limit = share * (1 + by)
     found = find_candidates(
         scene.labels, regions, scene.depth, scene.camera, database, Rules(covered_share=limit)
     )
