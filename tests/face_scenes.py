@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import cv2
 import numpy as np
 
 from workbench_stages.edges.planes import Camera
 from workbench_stages.edges.regions import region_features
-from workbench_stages.matching.database import Database, View, view_of
+from workbench_stages.matching.database import Database, View, make_database, view_of
 from workbench_stages.matching.recognise import Rules, find_candidates, verdict_of
 from workbench_stages.matching.surfaces import Surface, camera_from_surface, cut_out
 from workbench_stages.region_features import as_rows
@@ -54,15 +55,21 @@ class Scene:
         pose = camera_from_surface(np.asarray(at), normal, rotation_deg)
         corners = polygon @ pose[:3, :2].T + pose[:3, 3]
         pixels = corners[:, :2] / corners[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-        big = np.zeros((size * 8, size * 8), np.uint8)
-        cv2.fillPoly(big, [np.round((pixels + 0.5) * 8 - 0.5).astype(np.int32)], 1)
-        mask = big.reshape(size, 8, size, 8).mean(axis=(1, 3)) >= 0.5
+        # A pixel is the face's if most of its 8 by 8 parts are; only those around it are drawn.
+        left, top = np.clip(np.floor(pixels.min(axis=0)).astype(int) - 1, 0, size - 1)
+        right, bottom = np.clip(np.ceil(pixels.max(axis=0)).astype(int) + 2, 1, size)
+        height, width = max(bottom - top, 1), max(right - left, 1)
+        fine = np.zeros((height * 8, width * 8), np.uint8)
+        corners_px = np.round((pixels - [left, top] + 0.5) * 8 - 0.5)
+        cv2.fillPoly(fine, [corners_px.astype(np.int32)], 1)
+        share = fine.reshape(height, 8, width, 8).sum(axis=(1, 3), dtype=np.int32)
+        rows, columns = np.nonzero(share >= 32)
+        rows, columns = rows + top, columns + left
         self.count += 1
-        self.labels[mask] = self.count
-        y, x = np.mgrid[0:size, 0:size]
-        rx, ry = camera.rays(x, y)
+        self.labels[rows, columns] = self.count
+        rx, ry = camera.rays(columns, rows)
         z = (normal @ pose[:3, 3]) / (normal[0] * rx + normal[1] * ry + normal[2])
-        self.depth[mask] = z[mask]
+        self.depth[rows, columns] = z
         return self.count
 
     def surround(self, label: int, below_mm: Sequence[float]) -> None:
@@ -109,3 +116,9 @@ def views_of(polygon: np.ndarray, step_deg: float = 15.0) -> list[View]:
         _, surface = scene.surface(label)
         views.append(view_of(surface, float(angle), scene.depth, None))
     return views
+
+
+@cache
+def plate_and_ell() -> Database:
+    """A database of two parts, made once for all tests that only look at it."""
+    return make_database({"plate": views_of(RECTANGLE, 30.0), "ell": views_of(ELL, 30.0)})

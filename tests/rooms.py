@@ -84,6 +84,7 @@ FILES = {
     "test_settings": "pipeline",
     "test_simulate": "simulate",
     "test_sizes": "edges",
+    "test_stage_figures": "pipeline",
     "test_stage_in_parts": "pipeline",
     "test_surfaces": "matching",
     "test_sweep": "sweep",

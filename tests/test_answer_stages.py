@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from face_scenes import CAMERA, ELL, RECTANGLE, Scene, views_of
+from face_scenes import CAMERA, ELL, RECTANGLE, Scene, plate_and_ell
 
 from workbench.errors import DataError
 from workbench.stage import WARNINGS, Logged
-from workbench_stages.matching.database import Database, calibration_digest, make_database
+from workbench_stages.matching.database import Database, calibration_digest
 from workbench_stages.matching.pose import outline_m, project
 from workbench_stages.matching.report import blueprint, log_database
 from workbench_stages.matching.show import (
@@ -33,7 +33,7 @@ GREEN, BLUE, ORANGE, RED = (80, 220, 110), (90, 170, 255), (240, 170, 60), (240,
 
 @pytest.fixture(scope="module")
 def database() -> Database:
-    return make_database({"plate": views_of(RECTANGLE, 30.0), "ell": views_of(ELL, 30.0)}, "", 32)
+    return plate_and_ell()
 
 
 def inputs_of(scene: Scene, database: Database | None) -> dict[str, Any]:
@@ -578,7 +578,7 @@ def test_eigenimages_are_shown_by_their_sign_with_their_shares(database: Databas
     texts = recording.logged["models/ell/eigenimages/shares"][0].labels.as_arrow_array().to_pylist()
     assert texts == [f"{k + 1}: {100 * space.variance[k]:.1f} %" for k in range(count)]
     (picture,) = recording.logged["models/ell/eigenimages/picture"]
-    pitch = 32 * 4 + 6
+    pitch = 48 * 4 + 6
     rows = -(-count // 4)
     shape = picture.format.as_arrow_array().to_pylist()[0]
     assert (shape["height"], shape["width"]) == (rows * pitch, 4 * pitch)
@@ -586,8 +586,8 @@ def test_eigenimages_are_shown_by_their_sign_with_their_shares(database: Databas
     canvas = data.reshape(rows * pitch, 4 * pitch, 3)
     for k in (0, count - 1):
         top, left = (k // 4) * pitch, (k % 4) * pitch
-        shown = canvas[top : top + 128 : 4, left : left + 128 : 4].astype(int)
-        image = space.basis[k].reshape(32, 32)
+        shown = canvas[top : top + 192 : 4, left : left + 192 : 4].astype(int)
+        image = space.basis[k].reshape(48, 48)
         y, x = np.unravel_index(np.abs(image).argmax(), image.shape)
         # What is greatest is all red or all blue, and what is nothing is white.
         assert shown[y, x].tolist() in ([255, 0, 0], [0, 0, 255])
@@ -595,8 +595,8 @@ def test_eigenimages_are_shown_by_their_sign_with_their_shares(database: Databas
         y, x = np.unravel_index(np.abs(image).argmin(), image.shape)
         assert shown[y, x].min() > 250
     mean = recording.logged["models/ell/mean"][0]
-    levels = np.array(mean.buffer.as_arrow_array().to_pylist()[0], np.uint8).reshape(128, 128)
-    np.testing.assert_allclose(levels[::4, ::4], 255 * space.mean.reshape(32, 32), atol=1)
+    levels = np.array(mean.buffer.as_arrow_array().to_pylist()[0], np.uint8).reshape(192, 192)
+    np.testing.assert_allclose(levels[::4, ::4], 255 * space.mean.reshape(48, 48), atol=1)
 
 
 def test_a_space_of_two_dimensions_has_a_flat_curve(database: Database) -> None:

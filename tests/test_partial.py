@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from face_scenes import ELL, RECTANGLE, Scene, face, views_of
+from face_scenes import ELL, RECTANGLE, Scene, face, plate_and_ell
 
-from workbench_stages.matching.database import Database, make_database
+from workbench_stages.matching.database import Database
 from workbench_stages.matching.eigenspace import Outlines
 from workbench_stages.matching.partial import (
     Visible,
@@ -23,7 +23,7 @@ from workbench_stages.matching.surfaces import Surface, features_mm, upright_vie
 
 @pytest.fixture(scope="module")
 def database() -> Database:
-    return make_database({"plate": views_of(RECTANGLE, 30.0), "ell": views_of(ELL, 30.0)})
+    return plate_and_ell()
 
 
 def shown(

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from face_scenes import ELL, RECTANGLE, Scene, face, views_of
+from face_scenes import ELL, RECTANGLE, Scene, face, plate_and_ell
 
 from workbench_stages.edges.planes import Camera
-from workbench_stages.matching.database import Database, Part, make_database
+from workbench_stages.matching.database import Database, Part
+from workbench_stages.matching.pose import pose_of
 from workbench_stages.matching.recognise import (
     Reason,
     Rules,
@@ -25,12 +26,10 @@ from workbench_stages.matching.recognise import (
 )
 from workbench_stages.matching.surfaces import Surface, cut_out, features_mm
 
-STEP_DEG = 30.0
-
 
 @pytest.fixture(scope="module")
 def database() -> Database:
-    return make_database({"plate": views_of(RECTANGLE, STEP_DEG), "ell": views_of(ELL, STEP_DEG)})
+    return plate_and_ell()
 
 
 class Lone:
@@ -194,9 +193,9 @@ def test_a_face_that_is_not_flat_is_refused(
     assert Reason(plate.judge(database)["reason"]) is reason
 
 
-@pytest.mark.parametrize("over", [True, False])
+@pytest.mark.parametrize(("by", "over"), [(-1e-9, True), (0.0, False), (1e-9, False)])
 def test_a_region_counts_as_covered_over_its_share_of_the_border(
-    database: Database, over: bool
+    database: Database, by: float, over: bool
 ) -> None:
     """The share is the border pixels that say so over the region's own perimeter, in pixels."""
     scene = Scene()
@@ -209,7 +208,7 @@ def test_a_region_counts_as_covered_over_its_share_of_the_border(
         for a, b in ((scene.labels[:-1], scene.labels[1:]), (scene.labels[1:], scene.labels[:-1]))
     )
     share = (len(rows) + columns) / regions[low - 1]["perimeter_px"]
-    limit = share * (1 - 1e-9) if over else share * (1 + 1e-9)
+    limit = share * (1 + by)
     found = find_candidates(
         scene.labels, regions, scene.depth, scene.camera, database, Rules(covered_share=limit)
     )
@@ -499,6 +498,34 @@ def test_of_all_that_match_the_highest_is_picked(
     assert verdict["object"] == ("ell" if top == labels[1] else "plate")
     up = 1e3 * (0.795 - heights.min())
     assert verdict["reason"].startswith(f"topmost match, {up:.1f} mm up; {verdict['object']}: ")
+
+
+def test_an_image_of_twice_the_size_comes_to_the_same_answer(database: Database) -> None:
+    """The pick, its place and turn, and who covers whom: in millimetres nothing is another."""
+    found = []
+    for size, focal in ((256, 1300.0), (512, 2600.0)):
+        scene = Scene(Camera(focal, focal, (size - 1) / 2, (size - 1) / 2), size)
+        low = scene.add(RECTANGLE, 0.0, (-0.02, 0.03, 0.785))
+        high = scene.add(RECTANGLE * 0.4, 0.0, (0.004, 0.03, 0.77))
+        top = scene.add(ELL, 200.0, (0.01, -0.03, 0.765), 10.0, 40.0)
+        candidates, verdict = scene.judge(database)
+        assert (verdict["region"], verdict["object"]) == (top, "ell")
+        rows = {row["label"]: row for row in candidates}
+        assert {k: Reason(row["reason"]) for k, row in rows.items()} == {
+            low: Reason.OCCLUDED, high: Reason.TOO_SMALL, top: Reason.NONE,
+        }  # fmt: skip
+        assert rows[low]["occluded_by"] == high
+        region, surface = scene.surface(top)
+        pose = pose_of(surface, region, scene.depth, database, 1)
+        assert pose["rotation_deg"] == pytest.approx(200, abs=0.7)
+        found.append(
+            [
+                rows[low]["occluded_share"], *(1e3 * np.array(pose["grasp"]["position"])),
+                *pose["grasp"]["approach"], 1e-3 * rows[top]["area_mm2"],
+                rows[top]["perimeter_mm"] / 100,
+            ]
+        )  # fmt: skip
+    np.testing.assert_allclose(found[1], found[0], atol=0.05, rtol=1e-4)
 
 
 def test_a_higher_part_that_does_not_match_is_passed_over(database: Database) -> None:
