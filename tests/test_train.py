@@ -114,7 +114,6 @@ def test_without_models_there_is_no_verdict_and_no_failure(bench: Command, tmp_p
     assert line["poses"] == line["failures"] == []
 
 
-<<<<<<< HEAD
 def test_every_frame_of_the_scene_ends_in_the_pick_of_a_part_that_lies_there(
     bench: Command, tmp_path: Path
 ) -> None:
@@ -146,43 +145,3 @@ def test_every_frame_of_the_scene_ends_in_the_pick_of_a_part_that_lies_there(
         column, row = (round(K[k, k] * v / z + K[k, 2]) for k, v in enumerate((x, y)))
         assert truth.instances[row, column] == own, frame.index
         assert z == pytest.approx(truth.depth_m[row, column], abs=1e-3), frame.index
-=======
-@pytest.mark.parametrize(
-    ("recording", "frames", "objects"),
-    [("scene", "0:3", ["hex", "frustum", "hex"]), ("simulated", "1:2", [None])],
-)
-def test_an_export_tells_the_part_that_is_picked_and_its_pose(
-    tmp_path: Path, recording: str, frames: str, objects: list[str | None]
-) -> None:
-    """With the models beside the recording; of a pile to be rearranged, why, and no pose."""
-    done = workbench(
-        "export", SCENE.with_name(f"{recording}.mcap"), "--to", tmp_path / "out",
-        "--frames", frames, "--artifacts", "candidates",
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    lines = (tmp_path / "out" / "results.jsonl").read_text().splitlines()
-    for text, name in zip(lines, objects, strict=True):
-        line = json.loads(text)
-        verdict = line["verdict"]
-        with np.load(tmp_path / "out" / f"frame_{line['index']:06d}.npz") as arrays:
-            candidates = arrays["candidates"]
-        picked = candidates["label"][candidates["picked"]].tolist()
-        assert verdict["object"] == name
-        if name is None:
-            assert verdict["verdict"] == "rearrange" and verdict["region"] is None
-            assert "leaves the image" in verdict["reason"]
-            assert line["poses"] == picked == []
-            continue
-        assert verdict["verdict"] == "pick" and picked == [verdict["region"]]
-        assert (
-            verdict["reason"].startswith("topmost match, ") and f"; {name}: " in verdict["reason"]
-        )
-        (pose,) = line["poses"]
-        assert (pose["object"], pose["region"]) == (name, verdict["region"])
-        assert pose["accepted"] and pose["distance"] <= pose["zeta"]
-        assert np.shape(pose["camera_from_surface"]) == (4, 4)
-        # Into the pile, along the inward normal.
-        inward = -np.array(pose["camera_from_surface"])[:3, 2]
-        np.testing.assert_allclose(pose["grasp"]["approach"], inward, atol=1e-9)
-        assert pose["grasp"]["approach"][2] > 0
->>>>>>> wt-answer
