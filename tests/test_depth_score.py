@@ -310,6 +310,15 @@ def test_the_interior_rms_holds_every_outlier_in_full(outlier_mm: float) -> None
     assert found["faces' interior bias", "mm"].value == pytest.approx(bias, abs=1e-4)
 
 
+def test_percentiles_are_of_what_is_known() -> None:
+    error_mm = np.zeros((ROWS, COLUMNS))
+    near_edge = np.linspace(0, 10, NEAR_EDGE_PX)
+    near_edge[::2] = np.nan
+    error_mm[:, NEAR_EDGE] = near_edge.reshape(ROWS, -1)
+    found = errors_of(bar(), error_mm)["within 4 px of an edge, p95", "mm"]
+    assert (found.value, found.coverage) == (pytest.approx(9.5, abs=0.03), 0.5)
+
+
 def test_an_error_beyond_the_histogram_is_told_as_its_end() -> None:
     found = errors_of(bar(), np.full((ROWS, COLUMNS), 180.0))
     assert found["within 4 px of an edge, p95", "mm"].value == pytest.approx(100, abs=0.006)

@@ -259,15 +259,11 @@ class Unwilling:
     __hash__ = None  # type: ignore[assignment]
 
 
-class Nest:
-    """Numbers inside lists, so many deep."""
-
-    @staticmethod
-    def of(depth: int, value: int) -> Any:
-        made: Any = value
-        for _ in range(depth):
-            made = [made]
-        return made
+def nested(wrap: Any, depth: int, value: int) -> Any:
+    made: Any = value
+    for _ in range(depth):
+        made = wrap(made)
+    return made
 
 
 @pytest.mark.parametrize(
@@ -290,6 +286,13 @@ class Nest:
         (np.zeros((2, 2)), np.zeros((2, 2), int), "thing has 2×2 float64 and int64 in A, 2×2 in B"),
         (np.array([[1, 2], [3, 4]]), np.array([[1, 2], [0, 9]]), "thing[1][0] 3 in A, 0 in B"),
         (np.float32(1), NAN, "thing 1 in A, nan in B"),
+        (NAN, "x", "thing nan in A, x in B"),
+        ("x", NAN, "thing x in A, nan in B"),
+        ([1], None, "thing [1] in A, None in B"),
+        (None, (1,), "thing None in A, (1,) in B"),
+        ({"k": 1}, [1], "thing {'k': 1} in A, [1] in B"),
+        (np.zeros(1), "x", "thing [0.] in A, x in B"),
+        (Pose(1, "a"), None, "thing Pose(angle=1, name='a') in A, None in B"),
     ],
 )
 def test_an_object_tells_where_it_differs_and_what_each_holds(a: Any, b: Any, says: str) -> None:
@@ -327,9 +330,26 @@ def test_a_long_value_is_cut() -> None:
         assert says == f"thing {'a' * 57 + '…' if cut else 'a' * length} in A, b in B"
 
 
-def test_objects_are_followed_sixteen_deep() -> None:
-    assert not difference_of(THING, Nest.of(16, 1), Nest.of(16, 2)).same
-    assert difference_of(THING, Nest.of(17, 1), Nest.of(17, 2)).same
+@pytest.mark.parametrize(
+    "wrap", [lambda v: [v], lambda v: {"k": v}, lambda v: Pose(v, "same"), lambda v: Bare(v)]
+)
+def test_objects_are_followed_sixteen_deep(wrap: Any) -> None:
+    found = difference_of(THING, nested(wrap, 3, 1), nested(wrap, 3, 2))
+    assert found.differing == 1
+    # An object without fields of its own is as deep as what it holds.
+    deepest = 16 if not isinstance(wrap(1), Bare) else 8
+    assert not difference_of(THING, nested(wrap, deepest, 1), nested(wrap, deepest, 2)).same
+    beyond = deepest + 1
+    assert difference_of(THING, nested(wrap, beyond, 1), nested(wrap, beyond, 2)).same
+
+
+def test_what_contains_itself_is_told_once() -> None:
+    def circle(value: int) -> list[Any]:
+        found: list[Any] = [value]
+        found.append({"again": found})
+        return found
+
+    assert difference_of(THING, circle(1), circle(2)).says == "thing[0] 1 in A, 2 in B"
 
 
 def test_not_a_number_is_the_same_as_itself_wherever_it_stands() -> None:
@@ -398,6 +418,15 @@ def test_a_total_keeps_the_first_of_equals_and_sums_what_only_one_has() -> None:
     total.add(9, Difference("mask", 3, 10, at=(8, 9), box=(0, 0, 9, 5)))
     assert (total.worst_frame, total.worst_share, total.at) == (9, 0.3, (8, 9))
     assert total.box == (0, 0, 9, 9)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_bounds_over_frames_hold_those_of_each(order: int) -> None:
+    total = Total("stage", "mask", "mask")
+    boxes = [(1, 20, 33, 40), (5, 12, 31, 47)]
+    for frame, box in enumerate(boxes[::order]):
+        total.add(frame, Difference("mask", 1, 10, box=box))
+    assert total.box == (1, 12, 33, 47)
 
 
 def test_a_total_of_maps_is_where_the_greatest_is() -> None:

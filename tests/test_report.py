@@ -115,6 +115,8 @@ def test_times_have_a_median_and_a_worst() -> None:
         report.add(run_of(stage_ms={"a": ms, "b": 2 * ms}))
     assert (report.median_ms("a"), report.worst_ms["a"]) == (3.5, 9)
     assert (report.median_ms("b"), report.worst_ms["b"]) == (7, 18)
+    report.add(run_of(stage_ms={"c": 0.25}))
+    assert report.worst_ms["c"] == 0.25
 
 
 def test_times_of_a_long_run_are_some_4096_of_the_latest() -> None:
