@@ -158,6 +158,19 @@ def test_with_too_few_pixels_deep_inside_half_the_inset_is_tried_and_then_all(
     assert known.tolist() == [2100]
 
 
+@pytest.mark.parametrize("normal", NORMALS)
+def test_planes_of_several_regions_are_their_own(normal: np.ndarray) -> None:
+    labels = np.zeros(SHAPE, np.int32)
+    labels[5:70, 4:50], labels[12:77, 58:105] = 1, 2
+    points = np.array([[0.01, -0.02, 0.7], [0.0, 0.01, 0.76]])
+    depth = np.where(labels == 1, depth_of(normal, points[0]), depth_of(NORMALS[1], points[1]))
+    planes, _ = fit_planes(labels, depth, CAMERA, np.ones(SHAPE), inset=0.0)
+    for plane, wanted, point in zip(planes, (normal, NORMALS[1]), points, strict=True):
+        assert plane is not None
+        assert plane.normal == pytest.approx(wanted, abs=1e-5)
+        assert plane.height(point) == pytest.approx(0, abs=1e-6)
+
+
 def test_depth_that_is_none_has_no_part_and_labels_without_any_have_no_plane() -> None:
     labels = np.zeros((20, 60), np.int32)
     labels[:, :20], labels[:, 20:40], labels[:, 50:] = 1, 2, 4

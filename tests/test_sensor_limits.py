@@ -575,6 +575,18 @@ def test_saturation_of_far_is_taken_to_where_near_sees_it() -> None:
     )
 
 
+def test_saturation_between_two_pixels_spoils_both() -> None:
+    """A pixel of far that near sees half a pixel to the left of where it is."""
+    image = np.full(SHAPE, 60, np.uint8)
+    far = image.copy()
+    far[30, 40] = 255
+    half = Similarity(1.0, 0.0, 0.5, 0.0, SHAPE[1], SHAPE[0])
+    out = registered(image, far, calibration=calibration(similarity=half))
+    found = np.argwhere(out["saturated"])
+    assert (found[:, 0] == 30).all()
+    assert {39, 40} <= set(found[:, 1].tolist()) <= {38, 39, 40, 41}
+
+
 def test_what_is_not_a_number_carries_no_depth_and_spoils_nothing() -> None:
     near, far = scene().astype(np.float32), scene().astype(np.float32)
     near[10, 20], far[30, 40] = np.nan, np.inf
