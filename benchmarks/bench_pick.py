@@ -3,7 +3,8 @@
     python benchmarks/bench_pick.py
 
 Every stage on every frame of the committed pile recording, on one thread, in milliseconds and
-over one ``cv2.Canny`` of the same images in the same run.
+over one ``cv2.Canny`` of the same images in the same run.  Every round must come to the same picks,
+and no stage may fail.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from statistics import median
 
 import cv2
 import numpy as np
+from aims import end, must
 from bench_sensor import SCENE, in_turn
 from numba import set_num_threads
 from rich.console import Console
@@ -34,8 +36,13 @@ def stage_ms(preset: str, rounds: int) -> dict[str, tuple[str, float]]:
     """Each stage's chapter and median time over all frames."""
     session = Session.open(Options(SCENE, preset=preset), ResultStore(capacity_bytes=0))
     times: dict[str, list[float]] = {}
+    outcomes: dict[int, str] = {}
     for _ in range(rounds):
         for run in session.runs():
+            came_to = repr((run.artifacts.get("verdict"), run.artifacts.get("poses")))
+            first = outcomes.setdefault(run.frame.index, came_to)
+            must(came_to == first, f"frame {run.frame.index}, {preset}: each round's pick is alike")
+            must(not run.failures, f"frame {run.frame.index}, {preset}: no stage fails")
             for stage, milliseconds in run.stage_ms.items():
                 times.setdefault(stage, []).append(milliseconds)
     return {s.name: (s.chapter, median(times[s.name])) for s in session.pipeline.stages}
@@ -70,6 +77,7 @@ def main() -> None:
         row(chapter, stages, PAPER.get(chapter, ""))
     row("a whole frame", set.union(*chapters.values()), "over 1145 ms")
     Console(width=130).print(table)
+    end()
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
     python benchmarks/bench_tune.py                  # medians of 30
     python benchmarks/bench_tune.py --soak 5000      # memory over 5000 changes
 
+What the bench holds after the changes must be what a run with its parameters gives.
+
 Without a browser: from the change to the pieces that leave for the viewer, for the first stage
 that ran again and for the last.  With one (Chromium, software rendering): from the press on the
 slider's track to the first frame of the viewer's canvas whose pixels have changed.
@@ -22,8 +24,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import rerun as rr
+from aims import end, must
 
 import workbench
 from workbench.tune.canvas import Canvas, live_recording
@@ -76,7 +80,23 @@ def times(recording: Path) -> None:
             f"{statistics.median(last):.1f} ms to all that is downstream"
         )
     print(f"{sent[0] / (len(KNOBS) * (REPEATS + 3)) / 1e6:.2f} MB a change to the viewer")
+    check(bench, recording)
     bench.close()
+
+
+def check(bench: LiveBench, recording: Path) -> None:
+    """Hold what the bench has now to a run of its own with the same parameters."""
+    snapshot = bench.snapshot()
+    assert snapshot.run is not None
+    assignments = [f"{address}={value}" for address, value in snapshot.settings.changed.items()]
+    index = snapshot.run.frame.index
+    (run,) = workbench.open(recording, set=assignments, frames=(index, index + 1)).runs()
+    for name, value in run.artifacts.items():
+        if isinstance(value, np.ndarray):
+            same = np.array_equal(
+                value, snapshot.run.artifacts[name], equal_nan=value.dtype.kind == "f"
+            )
+            must(same, f"{name}: the live result is that of a run with its parameters")
 
 
 WATCH = """
@@ -217,6 +237,7 @@ def main() -> None:
     times(arguments.recording)
     if not arguments.no_browser:
         browser(arguments.recording)
+    end()
 
 
 if __name__ == "__main__":

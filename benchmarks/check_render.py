@@ -3,7 +3,9 @@
     python benchmarks/check_render.py recordings/scene.mcap [--frames 3] [--pictures DIR]
 
 Says, for each frame, by how much depth and images differ (rms in per cent of full scale), how many
-pixels lie at edges where the two see different surfaces, and how long the rendering took.
+pixels lie at edges where the two see different surfaces, and how long the rendering took.  Where
+both see the same surface the depth must be the same to 0.01 mm, and the images to 2 % of full scale
+in the root mean square; else the exit code is 1.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from aims import end, must
 
 from workbench.recording import Recording
 from workbench_stages.optics.rig import Rig
@@ -23,6 +26,7 @@ from workbench_stages.simulation.scene import Table
 
 PARTS = Path(__file__).parents[1] / "recordings" / "parts"
 EXPOSURE = 0.78 / 0.55
+MOST_MM, MOST_PERCENT = 0.01, 2.0
 
 
 def main() -> None:
@@ -70,12 +74,17 @@ def main() -> None:
                 name = f"{frame.index:03}_{channel}.png"
                 picture = cv2.resize(both, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
                 cv2.imwrite(str(arguments.pictures / name), picture.astype(np.uint8))
+        must(depth <= MOST_MM, f"frame {frame.index}: depth differs by {depth:.4f} mm")
+        for channel, percent in zip(("near", "far", "flat"), rms, strict=True):
+            says = f"frame {frame.index}: {channel} differs by {percent:.2f} % of full scale"
+            must(not percent > MOST_PERCENT, says)
         near, far, flat = rms
         print(
             f"{frame.index:5} {depth:11.4f} {(~same).sum():10} {near:8.2f} {far:8.2f} {flat:8.2f}"
             f" {seconds:9.2f}",
             flush=True,
         )
+    end()
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from workbench.errors import DataError
@@ -134,7 +134,7 @@ class Recognition(Stage):
             unit="share",
         )
 
-    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+    def compute(self, inputs: Inputs, parameters: Any) -> Iterator[Outputs]:
         import numpy as np
 
         from .edges.inputs import best_depth
@@ -143,7 +143,8 @@ class Recognition(Stage):
         database = inputs["models"]
         depth, camera = best_depth(inputs)
         if database is None or camera is None or depth is None:
-            return {"candidates": np.zeros(0, [("label", np.int32)]), "verdict": None}
+            yield {"candidates": np.zeros(0, [("label", np.int32)]), "verdict": None}
+            return
         try:
             database.check_calibration(inputs["calibration"])
         except ValueError as error:
@@ -152,7 +153,8 @@ class Recognition(Stage):
         candidates = find_candidates(
             inputs["labels"], inputs["regions"], depth, camera, database, rules
         )
-        return {"candidates": candidates, "verdict": verdict_of(candidates, database, rules)}
+        yield {"candidates": candidates}
+        yield {"verdict": verdict_of(candidates, database, rules)}
 
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr

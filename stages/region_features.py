@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from workbench.stage import (
@@ -67,7 +67,7 @@ class RegionFeatures(Stage):
             40, "Pixels that a plane should rest on.", low=8, high=2000, step=1, unit="px"
         )
 
-    def compute(self, inputs: Inputs, parameters: Any) -> Outputs:
+    def compute(self, inputs: Inputs, parameters: Any) -> Iterator[Outputs]:
         from .edges.inputs import best_depth
         from .edges.regions import closed_regions, region_features
 
@@ -79,6 +79,7 @@ class RegionFeatures(Stage):
             None if walls is None else walls.labels,
             min_area=parameters.min_area,
         )
+        yield {"labels": labels}
         depth, camera = best_depth(inputs)
         table = region_features(
             labels,
@@ -87,7 +88,7 @@ class RegionFeatures(Stage):
             inset=parameters.inset,
             least_points=parameters.least_points,
         )
-        return {"labels": labels, "regions": as_rows(table)}
+        yield {"regions": as_rows(table)}
 
     def log(self, recording: Any, logged: Logged) -> None:
         import rerun as rr

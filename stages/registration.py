@@ -141,8 +141,9 @@ class Registration(Stage):
         if far_saturated.any():
             moved = warp(far_saturated.astype(np.float32), similarity)
             saturated |= moved > 0.1
-        near = np.nan_to_num(near, copy=False)
-        far = warp(np.nan_to_num(far, copy=False), similarity)
+        # Infinity as well: the greatest float would drown the light of the whole image.
+        near, far = (np.nan_to_num(image, posinf=0, neginf=0) for image in (near, far))
+        far = warp(far, similarity)
 
         gain_drift = 1.0
         if from_optics:
@@ -170,10 +171,14 @@ class Registration(Stage):
         drift_px = misalignment_rms_px(near, far)
         if drift_px > _DRIFT_WARNING_PX:
             warnings.append(f"near and far are {drift_px:.1f} px apart after registration")
+        if flat is not None and flat.shape[:2] != near.shape:
+            warnings.append(
+                f"flat is {_size(flat)}, near is {_size(near_raw)}: the intensity is that of near "
+                "and far, with the stripes averaged out"
+            )
+            flat = None
         if flat is not None and parameters.intensity == "flat":
             intensity = grey(flat)
-            if intensity.shape != near.shape:
-                raise StageError(f"flat is {_size(flat)}, near is {_size(near_raw)}")
         else:
             intensity = average_over_period(cv2.addWeighted(near, 0.5, far, 0.5, 0), stripes)
         return {

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 from scipy import ndimage
+
+from workbench_stages.edges import operators
 
 
 def scene(shape: tuple[int, int] = (160, 200), seed: int = 0, noise: float = 1.0):
@@ -42,3 +47,34 @@ def eight(array: np.ndarray):
     for mirrored in (array, array.T):
         for quarter in range(4):
             yield np.ascontiguousarray(np.rot90(mirrored, quarter))
+
+
+def lines_of(shape: tuple[int, int], lengths: list[int]) -> np.ndarray:
+    """Level lines of these lengths in pixels, from column 4 on, in rows 10, 20, …; bool [H W]."""
+    image = np.zeros(shape, bool)
+    for number, length in enumerate(lengths, start=1):
+        image[10 * number, 4 : 4 + length] = True
+    return image
+
+
+def lines_facing(shape: tuple[int, int], distance: int) -> np.ndarray:
+    """Two pieces of one level line in row 30, whose ends lie ``distance`` pixels apart from 20."""
+    image = np.zeros(shape, bool)
+    image[30, 2:21] = True
+    image[30, 20 + distance : 20 + distance + 20] = True
+    return image
+
+
+@contextmanager
+def planted_operator() -> Iterator[None]:
+    """The operator ``planted``: 10 to the right wherever the image is not 9; bright as it is."""
+
+    @operators.register("planted", greatest=10.0)
+    def planted(image):
+        gx = np.where(image != 9, np.float32(10), np.float32(0))
+        return gx, np.zeros_like(gx), image
+
+    try:
+        yield
+    finally:
+        del operators.OPERATORS["planted"]

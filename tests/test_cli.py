@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import zipfile
@@ -17,6 +18,9 @@ import typer.main
 from mcap_fixtures import write_scene
 
 from workbench.cli import app
+from workbench.errors import DataError, UsageError
+from workbench.settings import SettingsError
+from workbench.stage import StageError
 
 Command = Callable[..., Any]
 ROOT = Path(__file__).parents[1]
@@ -255,6 +259,17 @@ WRONG = [
     ("calibrate {scene} -o c.npz --set x=1", 2, "x=1"),
     ("info {scene} --topic near", 2, "--topic near"),
     ("info {scene} --topic near=/x", 1, "/x"),
+    ("train {scene} -o none/m.npz", 1, "none/m.npz"),
+    ("train {scene} -o m.npz --save none/m.rrd", 1, "--save none/m.rrd"),
+    ("train {scene} -o m.npz --label a --label b", 2, "--label: expected one for each"),
+    ("train {scene} -o m.npz --angles 0,x", 2, "--angles 0,x"),
+    ("train {scene} -o m.npz --set train.x=1", 2, "train.x=1"),
+    ("train {scene} -o m.npz --set nothing.x=1", 2, "nothing"),
+    ("train {scene} -o m.npz --topic middle=/x", 2, "middle"),
+    ("train {scene} -o m.npz --calibration {tmp}/none.npz", 1, "none.npz"),
+    ("train {words} -o m.npz", 1, "words.mcap"),
+    ("train {tmp}/none.mcap -o m.npz", 1, "none.mcap"),
+    ("simulate {tmp}/none.toml -o a.mcap", 1, "none.toml"),
     # Typer's own.
     ("nothing", 2, "nothing"),
     ("info", 2, "REC"),
@@ -324,6 +339,7 @@ WRONG_CALIBRATIONS: dict[str, Callable[[Path, Path], Path]] = {
     "stripes of two numbers": lambda to, good: altered(to, good, stripes=np.zeros(2)),
     "a report that is no json": lambda to, good: altered(to, good, report=np.array("{")),
     "a version that is no number": lambda to, good: altered(to, good, version=np.array("one")),
+    "far before near": lambda to, good: altered(to, good, range_m=np.array([0.9, 0.6])),
     "a range that is no number": lambda to, good: altered(to, good, range_m=np.array([1, np.nan])),
 }
 
@@ -336,6 +352,27 @@ def test_a_wrong_calibration_is_told_in_one_line(
     ended = bench("evaluate", scene, "--frames", "0:1", "--calibration", wrong)
     assert "wrong.npz" in ended.mistake and "--calibration" in ended.mistake
     assert ended.code == 1
+
+
+@pytest.mark.parametrize(
+    ("range_m", "fits"),
+    [((0.6, 0.9), True), ((0.6, 0.6000001), True), ((1e-6, 9.0), True), ((0.9, 0.6), False),
+     ((0.6, 0.6), False), ((0.0, 0.9), False), ((-0.6, 0.9), False), ((-0.9, -0.6), False)],
+)  # fmt: skip
+def test_a_calibrations_working_range_goes_from_near_to_far(
+    calibration: Path, tmp_path: Path, range_m: tuple[float, float], fits: bool
+) -> None:
+    from workbench_stages.dfd.calibration import Calibration
+
+    path = altered(tmp_path / "c.npz", calibration, range_m=np.array(range_m))
+    if fits:
+        loaded = Calibration.load(path)
+        assert (loaded.near_z_m, loaded.far_z_m) == range_m
+        # The near end is at 0 of the relative depth, the far one at 1.
+        np.testing.assert_allclose(loaded.z_m(np.array([0.0, 1.0])), range_m, rtol=1e-6)
+    else:
+        with pytest.raises(ValueError, match="expected a working range in metres"):
+            Calibration.load(path)
 
 
 def test_a_calibration_for_another_image_size_says_both_sizes(
@@ -397,3 +434,83 @@ def test_a_reader_that_leaves_early_makes_no_noise(tmp_path: Path) -> None:
     script = f"{sys.executable} -c 'from workbench.cli import main; main()' stages | head -1"
     ended = subprocess.run(script, shell=True, capture_output=True, text=True, cwd=tmp_path)
     assert ended.stderr == ""
+
+
+# -- however a command ends -----------------------------------------------------------------------
+
+
+class Wrong(Exception):  # noqa: N818
+    """As the library of the command line tells of a wrong flag."""
+
+    def format_message(self) -> str:
+        return "no such\n  option"
+
+
+@pytest.mark.parametrize(
+    ("error", "received", "code", "says"),
+    [
+        (None, None, 0, ""),
+        (UsageError("--x: wrong"), None, 2, "workbench: --x: wrong\n"),
+        (SettingsError("blur.x: wrong"), None, 2, "workbench: blur.x: wrong\n"),
+        (DataError("a.mcap:\nbroken"), None, 1, "workbench: a.mcap: broken\n"),
+        (StageError("plugin"), None, 1, "workbench: plugin\n"),
+        (OSError(28, "No space left"), None, 1, "workbench: OSError: [Errno 28] No space left\n"),
+        (Wrong(), None, 2, "workbench: no such option\n"),
+        (KeyboardInterrupt(), signal.SIGINT, 130, ""),
+        (KeyboardInterrupt(), signal.SIGTERM, 143, ""),
+        (KeyboardInterrupt(), None, 130, ""),
+        (typer.Abort(), None, 130, ""),
+        (typer.Exit(1), None, 1, ""),
+        (typer.Exit(130), signal.SIGTERM, 143, ""),
+    ],
+)
+def test_an_end_is_an_exit_code_and_at_most_one_line(
+    bench: Command,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException | None,
+    received: int | None,
+    code: int,
+    says: str,
+) -> None:
+    from workbench import interrupts
+    from workbench.commands import info
+
+    def run(*_: object) -> None:
+        if error is not None:
+            raise error
+
+    monkeypatch.setattr(info, "run", run)
+    monkeypatch.setattr(interrupts, "_received", received)
+    ended = bench("info", "a.mcap")
+    assert (ended.code, ended.err, ended.out) == (code, says, "")
+
+
+def test_a_fault_of_the_bench_itself_is_not_hidden(
+    monkeypatch: pytest.MonkeyPatch, bench: Command
+) -> None:
+    from workbench.cli import main
+    from workbench.commands import info
+
+    def run(*_: object) -> None:
+        raise ZeroDivisionError
+
+    assert bench("--help").code == 0
+    monkeypatch.setattr(info, "run", run)
+    monkeypatch.setattr(sys, "argv", ["workbench", "info", "a.mcap"])
+    with pytest.raises(ZeroDivisionError):
+        main()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("1920x1080", (1920, 1080)), ("1X2", (1, 2)), ("3", None), ("3x", None), ("x4", None),
+     ("0x4", None), ("4x0", None), ("-1x4", None), ("4x4x4", None), ("1.5x2", None)],
+)  # fmt: skip
+def test_a_size_as_it_is_written(text: str, size: tuple[int, int] | None) -> None:
+    from workbench.cli import parse_size
+
+    if size is not None:
+        assert parse_size("--image-size", text) == size
+    else:
+        with pytest.raises(UsageError, match=f"--image-size {text}: expected WxH"):
+            parse_size("--image-size", text)

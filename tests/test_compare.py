@@ -17,6 +17,7 @@ import typer
 from test_replay import assert_whole, chunks, frames_of, rerun
 from waiting import PATIENCE_S, until_running
 
+from workbench.report import RunReport
 from workbench.session import Options, Session
 
 Command = Callable[..., Any]
@@ -239,6 +240,24 @@ def test_saved_replays_tell_what_the_recording_tells(
     assert saved["a"]["parameters"] == live["a"]["parameters"]
     assert saved["stages_that_differ"] == live["stages_that_differ"]
     assert {row["stage"] for row in saved["times"]} == {row["stage"] for row in live["times"]}
+    assert saved["frames"] == live["frames"] == 2 and not saved["same"] and not live["same"]
+    # Pictures are of artifacts: they differ on as many pixels, and at the same places.
+    pictures, artifacts = (
+        {row["artifact"]: row for row in told["results"]} for told in (saved, live)
+    )
+    for picture, artifact in (("linked", "edge_step"), ("labels", "labels")):
+        for key in ("kind", "differing_frames", "share", "worst_frame", "worst_share", "at", "box"):
+            assert pictures[picture][key] == artifacts[artifact][key], (picture, key)
+    # A is the replay that is named first, B the second: their scores are those of their own runs.
+    for side, changes in (("a", ()), ("b", (CHANGE,))):
+        session = session_of(scene, 2, *changes)
+        report = RunReport(session)
+        own = [report.add(run) for run in session.runs()]
+        for row in saved["scores"]:
+            values = [scores[f"{row['stage']}/{row['name']}"] for scores in own]
+            assert row[side] == pytest.approx(sum(values) / 2, rel=1e-6), (side, row)
+    assert all(row["difference"] == row["b"] - row["a"] for row in saved["scores"])
+    assert any(row["difference"] for row in saved["scores"])
     assert_whole(tmp_path / "a.rrd")
     shown = frames_of(tmp_path / "a.rrd")
     for side in "AB":

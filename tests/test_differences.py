@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from test_replay import frames_of
 
 from workbench.difference_pictures import has_picture, log_difference, span_of
 from workbench.differences import (
-    Difference,
     Knowledge,
     Place,
     Totals,
@@ -193,21 +194,30 @@ def test_one_parameter_changes_what_is_downstream_only(first_frames: list[Frame]
     assert not found["linked_edges"]["edges_reconstructed"].same
 
 
-def test_every_kind_of_picture_can_be_logged() -> None:
+def test_every_kind_of_picture_comes_back_from_a_file(tmp_path: Path) -> None:
+    """On the frame on which it was logged, and one that no longer differs is cleared."""
     import rerun as rr
 
+    path = tmp_path / "differences.rrd"
     recording = rr.RecordingStream("test", recording_id="test")
-    stream = rr.memory_recording(recording)
-    recording.set_time("frame", sequence=0)
-    empty = Difference("map", 0, 4)
-    assert not has_picture(empty)
-    log_difference(recording, "difference/none", empty)
+    recording.save(path)
     a = np.eye(5, dtype=np.float32)
-    for artifact, dtype in ((MASK, bool), (CODES, np.uint8), (LABELS, np.int32), (MAP, np.float32)):
-        found = difference_of(artifact, a.astype(dtype), a[::-1].astype(dtype).copy() * 0)
-        assert has_picture(found)
-        log_difference(recording, f"difference/{artifact.name}", found)
-    assert stream.num_msgs() > 4
+    artifacts = ((MASK, bool), (CODES, np.uint8), (LABELS, np.int32), (MAP, np.float32))
+    for frame in (3, 4):
+        recording.set_time("frame", sequence=frame)
+        for artifact, dtype in artifacts:
+            b = a * (0 if frame == 3 else 1)
+            found = difference_of(artifact, a.astype(dtype), b.astype(dtype))
+            assert has_picture(found) == (frame == 3)
+            log_difference(recording, f"difference/{artifact.name}", found)
+    recording.flush()
+    recording.disconnect()
+    shown = frames_of(path)
+    pictures = {"mask": "states", "codes": "states", "labels": "states", "map": "values"}
+    for name, picture in pictures.items():
+        assert shown[f"difference/{name}/{picture}"] == {3}, name
+        assert shown[f"difference/{name}"] == {3, 4}, name
+    assert shown["difference/map/known"] == shown["difference/map/scale/ticks"] == {3}
 
 
 def test_the_scale_of_a_map_is_round_and_holds_most_of_it() -> None:

@@ -6,8 +6,8 @@ from edge_scenes import eight, scene
 from scipy import ndimage
 from skimage.filters import apply_hysteresis_threshold
 
-from workbench_stages.edges.operators import gradient_of
-from workbench_stages.edges.stack import build_stack, noise_model, segment_curve
+from workbench_stages.edges.operators import Gradient, gradient_of
+from workbench_stages.edges.stack import NoiseModel, build_stack, noise_model, segment_curve
 
 EIGHT = np.ones((3, 3))
 
@@ -118,3 +118,185 @@ def test_the_stack_turns_with_the_image():
 def test_wrong_thresholds_are_refused(wrong):
     with pytest.raises(ValueError):
         build_stack(np.zeros((4, 4), np.float32), np.zeros((4, 4), bool), **wrong)
+
+
+# -- planted segments ----------------------------------------------------------------------------
+
+
+def planted(*segments):
+    """Level lines of strengths given pixel by pixel, two rows apart: strength and candidates."""
+    strength = np.zeros((4 * len(segments) + 2, 40), np.float32)
+    for number, values in enumerate(segments):
+        strength[4 * number + 1, 1 : 1 + len(values)] = values
+    return strength, strength > 0
+
+
+def stack_of(*segments, **changes):
+    how = {"lowest": 1.0, "greatest": 9.0, "steps": 17, "small_segment": 4.0} | changes
+    # 42 pixels a side or so: a small segment would have 2 pixels, so the length is given for it.
+    strength, thin = planted(*segments)
+    how["small_segment"] *= 256 / np.sqrt(strength.size)
+    return build_stack(strength, thin, **how)
+
+
+def test_the_thresholds_run_evenly_from_the_lowest_to_the_greatest():
+    stack = stack_of([5] * 6)
+    np.testing.assert_allclose(stack.thresholds, np.arange(1, 9.5, 0.5))
+    assert stack_of([5] * 6, steps=2).thresholds.tolist() == [1, 9]
+
+
+def test_the_low_threshold_is_the_least_at_which_small_segments_are_few_enough():
+    """Twenty strong pixels in one segment, and two small ones of strengths 2 and 4."""
+    segments = [8.0] * 20, [2.0] * 2, [4.0] * 2
+    stack = stack_of(*segments, max_ratio=0.15)
+    np.testing.assert_array_equal(stack.small_pixels[:8], [4, 4, 4, 2, 2, 2, 2, 0])
+    np.testing.assert_array_equal(stack.large_pixels[:15], 20)
+    np.testing.assert_array_equal(stack.large_pixels[15:], 0)
+    np.testing.assert_allclose(stack.ratio[[0, 3, 7]], [0.2, 0.1, 0])
+    assert np.isnan(stack.ratio[15:]).all()
+    assert stack.upheld
+    # Strength 2 is still cut in at 2: the first threshold that leaves it out is the next one.
+    assert stack.low_threshold == 2.5
+    assert stack.high_thresholds == (9.0, 5.75, 2.5)
+    # The ratio must be under the preset value, not at it.
+    assert stack_of(*segments, max_ratio=0.1).low_threshold == 4.5
+    assert stack_of(*segments, max_ratio=0.2).low_threshold == 2.5
+    assert stack_of(*segments, max_ratio=0.201).low_threshold == 1.0
+
+
+def test_where_no_threshold_keeps_the_ratio_the_nearest_is_taken():
+    # Small segments of strength 8 stay as long as the large one does; some of 3 do not.
+    stack = stack_of([8.0] * 10, [8.0] * 2, [3.0] * 2, max_ratio=0.05)
+    assert not stack.upheld
+    assert stack.low_threshold == 3.5
+    assert stack.ratio.min(where=np.isfinite(stack.ratio), initial=np.inf) == 0.2
+    # Without any large segment the greatest threshold is left.
+    alone = stack_of([8.0] * 2, [3.0])
+    assert not alone.upheld
+    assert alone.low_threshold == 9.0
+    assert np.isinf(alone.ratio[0])
+
+
+@pytest.mark.parametrize("peak", [1, 5.75, 9])
+def test_a_segment_is_in_an_image_whose_threshold_its_strongest_pixel_reaches(peak):
+    """With a low threshold of 2.5 the others are 5.75 and 9; a peak at a threshold is in."""
+    low = np.nextafter
+    values = [2.5, 2.5, max(peak, 2.5), 2.5, 2.5]
+    under = [2.5, 2.5, max(float(low(np.float32(peak), np.float32(0))), 2.5), 2.5, 2.5]
+    stack = stack_of([9.5] * 30, [2.0] * 3, values, under, max_ratio=0.05)
+    assert stack.low_threshold == 2.5
+    images = (stack.edges_low, stack.edges_medium, stack.edges_high)
+    assert [bool(image[9, 1:6].all()) for image in images] == [peak >= 9, peak >= 5.75, True]
+    assert [bool(image[13, 1:6].all()) for image in images] == [False, peak > 5.75, True]
+    assert [bool(image[5].any()) for image in images] == [False] * 3
+    assert stack.segment_peak[9, 1] == max(peak, 2.5)
+    assert stack.segment_peak[5].max() == 0
+
+
+def test_pixels_under_the_low_threshold_part_a_segment():
+    stack = stack_of([9.0, 3.0, 2.4, 3.0, 3.0], lowest=2.5, max_ratio=99.0, small_segment=2.0)
+    np.testing.assert_array_equal(stack.segment_peak[1, 1:6], [9, 9, 0, 3, 3])
+    assert stack.low_threshold == 2.5
+    assert stack.edges_low[1].sum() == 2
+    assert stack.edges_high[1].sum() == 4
+
+
+def test_segments_touch_over_their_corners_in_every_direction():
+    """Eight neighbours of a strong pixel, one at a time, and none two pixels away."""
+    for dy in (-2, -1, 0, 1, 2):
+        for dx in (-2, -1, 0, 1, 2):
+            strength = np.zeros((7, 9), np.float32)
+            strength[3, 4] = 9
+            strength[3 + dy, 4 + dx] = max(strength[3 + dy, 4 + dx], 2)
+            stack = build_stack(strength, strength > 0, lowest=2, greatest=8, max_ratio=9.0)
+            joined = max(abs(dx), abs(dy)) <= 1
+            assert stack.edges_low[3 + dy, 4 + dx] == joined
+            # Two that touch are large in so small an image, one alone is small.
+            assert stack.large_pixels[0] == (2 if joined and (dx or dy) else 0)
+
+
+def test_nothing_is_an_edge_that_is_no_candidate_even_from_zero_on():
+    strength, thin = planted([5.0] * 8)
+    stack = build_stack(strength, thin & False, lowest=0, greatest=9)
+    assert not stack.edges_high.any()
+    stack = build_stack(strength, thin, lowest=0, greatest=9)
+    np.testing.assert_array_equal(stack.edges_high, thin)
+
+
+def test_a_ratio_for_a_wanted_low_threshold_puts_it_there():
+    segments = [8.0] * 20, [2.0] * 2, [4.0] * 2
+    stack = stack_of(*segments, max_ratio=0.15)
+    # The low threshold can lie at 1, where the search begins, at 2.5 and at 4.5.
+    for wanted, reached in ((0.0, 1.0), (1.6, 1.0), (1.9, 2.5), (3.4, 2.5), (3.6, 4.5), (9, 4.5)):
+        again = stack_of(*segments, max_ratio=stack.ratio_for_low(wanted))
+        assert again.low_threshold == reached
+        assert again.upheld
+    assert stack_of([8.0] * 2).ratio_for_low(3.0) == np.inf
+
+
+# -- noise ---------------------------------------------------------------------------------------
+
+RAYLEIGH = np.sqrt(-2 * np.log(1 - 0.2))
+
+
+def noisy(levels):
+    """A gradient with, for each (bright, magnitude, count), so many pixels; and their sigma.
+
+    The quantile of equal magnitudes is read by the share into their step of a sixteenth.
+    """
+    bright = np.concatenate([np.full(n, b, np.float32) for b, _, n in levels])[None]
+    magnitude = np.concatenate([np.full(n, m, np.float32) for _, m, n in levels])[None]
+    zero = np.zeros_like(bright)
+    gradient = Gradient(zero, zero, magnitude, zero > 1, bright, 20.0, bright)
+    return gradient, [(np.floor(m * 16) + 0.2) / 16 / RAYLEIGH for _, m, _ in levels]
+
+
+def test_noise_rises_along_the_line_that_no_measured_level_falls_below():
+    """Least at grey 72 (bin 4); of the brighter ones the one with the flattest rise sets it."""
+    gradient, sigma = noisy([(40, 3, 500), (72, 1, 500), (136, 4, 500), (168, 2, 500)])
+    model = noise_model(gradient)
+    variance = np.square(sigma)
+    rise = (variance[3] - variance[1]) / (168 - 72)
+    assert rise < (variance[2] - variance[1]) / (136 - 72)
+    wanted = variance[1] + rise * np.maximum(model.level - 72, 0)
+    np.testing.assert_allclose(model.level, np.arange(16) * 16 + 8)
+    np.testing.assert_allclose(model.sigma, np.sqrt(wanted), rtol=1e-4)
+
+
+def test_noise_is_the_same_everywhere_where_one_level_was_measured():
+    gradient, sigma = noisy([(72, 1, 500)])
+    np.testing.assert_allclose(noise_model(gradient).sigma, sigma[0], rtol=1e-5)
+
+
+def test_noise_has_a_least_value_and_clipped_white_is_not_measured():
+    assert (noise_model(noisy([(72, 0.05, 500)])[0]).sigma == np.float32(0.25)).all()
+    assert (noise_model(noisy([(72, 0.05, 500)])[0], least=0.5).sigma == np.float32(0.5)).all()
+    # Levels 240 and up are the brightest bin.
+    assert (noise_model(noisy([(241, 3, 500)])[0]).sigma == np.float32(0.25)).all()
+    gradient, sigma = noisy([(239, 3, 500)])
+    np.testing.assert_allclose(noise_model(gradient).sigma, sigma[0], rtol=1e-5)
+    # A measured value of half the least or less is rounding, not noise.
+    for least, measured in ((0.25, False), (0.2, True)):
+        gradient, sigma = noisy([(72, 0.07, 500), (136, 2, 500)])
+        assert (sigma[0] > 0.5 * least) == measured
+        model = noise_model(gradient, least=least)
+        assert model.sigma[8] == pytest.approx(sigma[1], rel=1e-4)
+        assert bool(model.sigma[4] < 0.5 * sigma[1]) == measured
+
+
+def test_another_quantile_reads_the_same_noise_from_rayleighs_law():
+    rng = np.random.default_rng(0)
+    magnitude = (1.7 * np.sqrt(-2 * np.log(rng.random((250, 400))))).astype(np.float32)
+    bright = np.full(magnitude.shape, 100, np.float32)
+    gradient = Gradient(bright, bright, magnitude, bright > 999, bright, 20.0, bright)
+    for quantile in (0.1, 0.2, 0.5):
+        assert noise_model(gradient, quantile).sigma[6] == pytest.approx(1.7, rel=0.02)
+
+
+def test_between_levels_noise_is_linear_and_beyond_the_ends_it_stays():
+    model = NoiseModel(
+        np.arange(8, 256, 16, dtype=np.float32), np.linspace(1, 4, 16, dtype=np.float32) ** 2
+    )
+    level = np.array([[-5, 0, 8, 12, 24, 100.5, 240, 248, 300]], np.float32)
+    wanted = np.interp(level, model.level, model.sigma)
+    np.testing.assert_allclose(model.at(level), wanted, rtol=1e-6)

@@ -167,6 +167,16 @@ def test_a_line_near_the_border_is_linked_to_it():
     assert not link(edges, border=False).links_drawn.any()
 
 
+def test_a_line_along_a_border_goes_on_along_it_on_every_side():
+    """Four pixels short of the corner, and far from any other."""
+    edges = np.zeros((44, 60), bool)
+    edges[0, 4:30] = True
+    whole = edges.copy()
+    whole[0, :4] = True
+    for turned, wanted in zip(eight(edges), eight(whole), strict=True):
+        np.testing.assert_array_equal(link(turned, windows=(6.0,), corners=0.0).edges, wanted)
+
+
 def test_linking_turns_with_the_edges():
     rng = np.random.default_rng(5)
     for k in range(4):

@@ -2,91 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
+from face_scenes import CAMERA, ELL, RECTANGLE, Scene, normal_of, views_of
 
-from workbench_stages.edges.planes import Camera
-from workbench_stages.edges.regions import region_features
-from workbench_stages.matching.database import Database, make_database, turn_profile, view_of
+from workbench_stages.matching.database import Database, make_database, turn_profile
 from workbench_stages.matching.pose import outline_mm, pose_of
-from workbench_stages.matching.recognise import Reason, Rules, find_candidates, verdict_of
-from workbench_stages.matching.surfaces import (
-    camera_from_surface,
-    cut_out,
-    features_mm,
-    shortest_turn,
-)
-from workbench_stages.region_features import as_rows
-
-CAMERA = Camera(1300.0, 1300.0, 127.5, 127.5)
-SIZE = 256
-TABLE_M = 0.795
-RECTANGLE = np.array([[-25, -15], [25, -15], [25, 15], [-25, 15]]) * 1e-3
-ELL = np.array([[-21, -15], [30, -15], [30, 5], [-1, 5], [-1, 25], [-21, 25]]) * 1e-3
-
-
-def normal_of(tilt_deg: float, towards_deg: float) -> np.ndarray:
-    tilt, towards = np.radians([tilt_deg, towards_deg])
-    return np.array([np.sin(tilt) * np.cos(towards), np.sin(tilt) * np.sin(towards), -np.cos(tilt)])
-
-
-class Scene:
-    """Flat polygons over a table, painted far to near."""
-
-    def __init__(self) -> None:
-        self.labels = np.ones((SIZE, SIZE), np.int32)
-        self.depth = np.full((SIZE, SIZE), TABLE_M, np.float32)
-        self.count = 1
-
-    def add(
-        self,
-        polygon: np.ndarray,
-        rotation_deg: float,
-        at: Sequence[float] = (0.0, 0.0, 0.775),
-        tilt_deg: float = 0.0,
-        towards_deg: float = 0.0,
-    ) -> int:
-        """Paint a face (metres, y up); returns its label."""
-        normal = normal_of(tilt_deg, towards_deg)
-        pose = camera_from_surface(np.asarray(at), normal, rotation_deg)
-        corners = polygon @ pose[:3, :2].T + pose[:3, 3]
-        pixels = corners[:, :2] / corners[:, 2:] * CAMERA.fx + CAMERA.cx
-        big = np.zeros((SIZE * 8, SIZE * 8), np.uint8)
-        cv2.fillPoly(big, [np.round((pixels + 0.5) * 8 - 0.5).astype(np.int32)], 1)
-        mask = big.reshape(SIZE, 8, SIZE, 8).mean(axis=(1, 3)) >= 0.5
-        self.count += 1
-        self.labels[mask] = self.count
-        y, x = np.mgrid[0:SIZE, 0:SIZE]
-        rx, ry = CAMERA.rays(x, y)
-        z = (normal @ pose[:3, 3]) / (normal[0] * rx + normal[1] * ry + normal[2])
-        self.depth[mask] = z[mask]
-        return self.count
-
-    def regions(self) -> np.ndarray:
-        return as_rows(region_features(self.labels, self.depth, CAMERA))
-
-    def judge(self, database: Database, rules: Rules | None = None) -> tuple[np.ndarray, dict]:
-        rules = rules or Rules()
-        found = find_candidates(self.labels, self.regions(), self.depth, CAMERA, database, rules)
-        return found, verdict_of(found, database, rules)
-
-    def surface(self, label: int):
-        row = self.regions()[label - 1]
-        return row, cut_out(self.labels, label, row["point_m"], row["normal"], CAMERA)
-
-
-def views_of(polygon: np.ndarray, step_deg: float = 15.0):
-    views = []
-    for angle in np.arange(0, 360, step_deg):
-        scene = Scene()
-        label = scene.add(polygon, angle)
-        _, surface = scene.surface(label)
-        views.append(view_of(surface, float(angle), scene.depth, None))
-    return views
+from workbench_stages.matching.recognise import Reason, Rules
+from workbench_stages.matching.surfaces import features_mm, shortest_turn
 
 
 @pytest.fixture(scope="module")

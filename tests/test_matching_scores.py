@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_matching import CAMERA, ELL, RECTANGLE, Scene, normal_of, views_of
+from face_scenes import CAMERA, ELL, RECTANGLE, Scene, normal_of, views_of
 
 from workbench.stage import Score
 from workbench_stages.matching.database import Database, make_database

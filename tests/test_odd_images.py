@@ -72,3 +72,44 @@ def test_images_of_unlike_size_are_told_with_both_sizes() -> None:
     run = Pipeline(STAGES, resolve(STAGES)).run(with_images(images))
     assert "64×64" in run.failures[0].says
     assert "64×48" in run.failures[0].says
+
+
+def test_a_flat_image_of_another_size_costs_nothing_but_itself() -> None:
+    images = alike(ODD["noise"])
+    without = Pipeline(STAGES, resolve(STAGES)).run(with_images(images))
+    other = images | {"flat": noise((48, 64), 255, np.uint8)}
+    run = Pipeline(STAGES, resolve(STAGES)).run(with_images(other))
+    assert not run.failures
+    told = [says for says in run.warnings if says not in without.warnings]
+    assert len(told) == 1 and "flat is 64×48, near is 64×64" in told[0]
+    for name in ("intensity", "near", "labels"):
+        assert np.array_equal(run.artifacts[name], without.artifacts[name])
+
+
+@pytest.mark.parametrize(
+    ("broken", "lost", "stays"),
+    [
+        ("workbench_stages.dfd.cloud.cloud_from_depth", "cloud_xyz_m", "depth_m"),
+        ("workbench_stages.edges.regions.region_features", "regions", "labels"),
+    ],
+)
+def test_what_fails_late_in_a_stage_leaves_what_it_had_given(
+    broken: str, lost: str, stays: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from conftest import SCENE
+
+    import workbench
+
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("no library")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(broken, fails)
+        (run,) = workbench.open(SCENE, frames=(0, 1)).runs()
+    (sound,) = workbench.open(SCENE, frames=(0, 1)).runs()
+    owner = next(failure for failure in run.failures if failure.blocked_by is None)
+    assert owner.says == "RuntimeError: no library" and stays in owner.gave
+    assert lost not in run.artifacts
+    assert np.array_equal(run.artifacts[stays], sound.artifacts[stays], equal_nan=True)
+    blocked = {failure.stage for failure in run.failures if failure.blocked_by == owner.stage}
+    assert blocked == ({"recognition", "pose_frames"} if lost == "regions" else set())

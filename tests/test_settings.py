@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -14,8 +15,10 @@ from workbench.settings import (
     SettingsError,
     adjusted,
     preset_names,
+    reason_in,
     resolve,
     to_toml,
+    value_from_text,
 )
 from workbench.stage import Knob, Stage, StageParameters, knob
 
@@ -254,3 +257,111 @@ def test_every_stage_and_artifact_has_words(one: Stage) -> None:
     for artifact in one.gives:
         if artifact.name.endswith(("_m", "_mm", "_px", "_deg")) and artifact.dtype != "object":
             assert artifact.unit == artifact.name.rpartition("_")[2]
+
+
+# -- what is remembered of presets ----------------------------------------------------------------
+
+
+def test_two_classes_of_one_name_have_presets_of_their_own() -> None:
+    def blur(sigma: float) -> Stage:
+        class Parameters(StageParameters):
+            sigma: float = knob(1.0, "How wide.", low=0, high=10)
+
+        members = {
+            "name": "blur", "Parameters": Parameters, "presets": {"soft": {"sigma": sigma}},
+        }  # fmt: skip
+        made: Stage = type("Blur", (Stage,), members)()
+        return made
+
+    for one in (blur(2.0), blur(3.0), blur(2.0)):
+        soft = resolve({"blur": one}, "soft")
+        own = type(one).presets["soft"]["sigma"]
+        assert flat(soft) == {"blur.sigma": own} and soft.changed == {}
+        tuned = resolve({"blur": one}, "soft", assignments=["blur.sigma=2.5"])
+        assert tuned.changed == {"blur.sigma": 2.5}
+        assert resolve({"blur": one}, "soft", assignments=[f"blur.sigma={own}"]).changed == {}
+
+
+def test_a_stage_without_a_preset_of_that_name_keeps_its_defaults() -> None:
+    hard = resolve(STAGES, "hard")
+    assert flat(hard)["blur.sigma"] == 1.0 and flat(hard)["cut.level"] == 1.0
+    assert hard.changed == {}
+
+
+def test_the_presets_of_all_stages_are_named_once_the_default_first() -> None:
+    assert preset_names(STAGES.values()) == ["default", "hard", "soft"]
+    assert preset_names([]) == ["default"]
+
+    class Own(Cut):
+        presets = {"default": {"level": 0.1}, "able": {}}
+
+    assert preset_names([Own()]) == ["default", "able"]
+    assert flat(resolve({"cut": Own()}))["cut.level"] == 0.1
+
+
+def test_adjusting_several_parameters_of_a_stage_at_once_and_leaving_the_others() -> None:
+    tuned = adjusted(
+        STAGES, resolve(STAGES, "soft", assignments=["blur.kind=box"]),
+        {"blur.rounds": 3, "blur.sigma": 5.0},
+    )  # fmt: skip
+    assert flat(tuned) == flat(resolve(STAGES, "soft")) | {
+        "blur.kind": "box", "blur.rounds": 3, "blur.sigma": 5.0
+    }  # fmt: skip
+    assert tuned.preset == "soft"
+    assert tuned.changed == {"blur.kind": "box", "blur.rounds": 3, "blur.sigma": 5.0}
+
+
+def test_a_written_configuration_holds_what_was_changed_the_reason_and_nothing_more(
+    tmp_path: Path,
+) -> None:
+    settings = resolve(STAGES, "soft", assignments=["cut.level=0.5", "blur.wrap=true"])
+    path = toml(tmp_path, to_toml(settings, "dark parts", {"a": None, "b": {"c": [1, None]}}))
+    assert tomllib.loads(path.read_text()) == {
+        "preset": "soft",
+        "reason": "dark parts",
+        "parameters": {"cut": {"level": 0.5}, "blur": {"wrap": True}},
+        "provenance": {"b": {"c": [1]}},
+    }
+    assert reason_in(path) == "dark parts"
+    plain = toml(tmp_path, to_toml(settings))
+    assert tomllib.loads(plain.read_text()).keys() == {"preset", "parameters"}
+    assert reason_in(plain) == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("2", 2), ("2.0", 2.0), ("true", True), ("[1, 2]", [1, 2]), ("word", "word"),
+     ("'1'", "1"), ("", ""), ("a b", "a b"), ("1,2", "1,2")],
+)  # fmt: skip
+def test_a_text_is_the_value_that_it_looks_like(text: str, value: Any) -> None:
+    found = value_from_text(text)
+    assert found == value and type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "low", "high", "step", "unit", "choices"),
+    [
+        ("sigma", "float", 0, 10, 0.5, "px", ()),
+        ("rounds", "int", 1, 6, 1, "rounds", ()),
+        ("kind", "choice", None, None, None, "", ("box", "gauss")),
+        ("wrap", "bool", None, None, None, "", ()),
+        ("label", "text", None, None, None, "", ()),
+    ],
+)
+def test_a_knob_says_all_of_its_declaration(
+    name: str, kind: str, low: Any, high: Any, step: Any, unit: str, choices: tuple[str, ...]
+) -> None:
+    declared = Blur.Parameters.knobs()[name]
+    assert (declared.name, declared.kind, declared.low, declared.high) == (name, kind, low, high)
+    assert (declared.step, declared.unit, declared.choices) == (step, unit, choices)
+    assert declared.default == getattr(Blur.Parameters(), name) and declared.why.endswith(".")
+
+
+@pytest.mark.parametrize(("value", "fits"), [(0, True), (10, True), (-0.001, False),
+                                             (10.001, False)])  # fmt: skip
+def test_the_ends_of_a_range_belong_to_it(value: float, fits: bool) -> None:
+    if fits:
+        assert flat(resolve(STAGES, assignments=[f"blur.sigma={value}"]))["blur.sigma"] == value
+    else:
+        with pytest.raises(SettingsError, match=r"blur\.sigma"):
+            resolve(STAGES, assignments=[f"blur.sigma={value}"])

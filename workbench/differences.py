@@ -255,9 +255,12 @@ def _of_arrays(a: NDArray[Any], b: NDArray[Any]) -> Difference:
         return Difference("array", 0, a.size)
     largest, place = None, np.unravel_index(int(changed.argmax()), changed.shape)
     if a.dtype.kind in "iuf":
-        size = np.where(changed, np.abs(b.astype(np.float64) - a.astype(np.float64)), 0)
-        if np.isfinite(size).any():
-            peak = int(np.nanargmax(np.where(np.isfinite(size), size, np.nan)))
+        # What is not finite in one of them differs, but by no amount.
+        finite = changed & np.isfinite(a) & np.isfinite(b)
+        if finite.any():
+            size = np.zeros(a.shape)
+            size[finite] = np.abs(b[finite].astype(np.float64) - a[finite].astype(np.float64))
+            peak = int(size.argmax())
             largest, place = float(size.flat[peak]), np.unravel_index(peak, size.shape)
     return Difference(
         "array", count, a.size, largest=largest, at=tuple(int(index) for index in place)
@@ -282,7 +285,7 @@ class _Leaf:
 
 
 def _of_objects(a: Any, b: Any, name: str) -> Difference:
-    leaves = list(_leaves(a, b, name, set(), 0))
+    leaves = list(_leaves(a, b, name, frozenset(), 0))
     if not leaves:
         return Difference("object", 0)
     says = "; ".join(f"{leaf.path} {leaf.says}" for leaf in leaves[:_TOLD])
@@ -291,32 +294,35 @@ def _of_objects(a: Any, b: Any, name: str) -> Difference:
     return Difference("object", sum(leaf.count for leaf in leaves), says=says)
 
 
-def _leaves(a: Any, b: Any, path: str, seen: set[tuple[int, int]], depth: int) -> Iterator[_Leaf]:
-    if a is b or (id(a), id(b)) in seen or depth > _DEEPEST:
+def _leaves(
+    a: Any, b: Any, path: str, within: frozenset[tuple[int, int]], depth: int
+) -> Iterator[_Leaf]:
+    """Where two objects differ; ``within`` are the pairs that they are inside of."""
+    if a is b or (id(a), id(b)) in within or depth > _DEEPEST:
         return
-    seen.add((id(a), id(b)))
+    within |= {(id(a), id(b))}
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         yield from _leaves_of_arrays(a, b, path)
     elif isinstance(a, Mapping) and isinstance(b, Mapping):
         for key in [*a, *(key for key in b if key not in a)]:
             inner = f"{path}.{key}"
             if key in a and key in b:
-                yield from _leaves(a[key], b[key], inner, seen, depth + 1)
+                yield from _leaves(a[key], b[key], inner, within, depth + 1)
             else:
                 yield _Leaf(inner, f"only in {'A' if key in a else 'B'}")
     elif isinstance(a, list | tuple) and isinstance(b, list | tuple):
         if len(a) != len(b):
             yield _Leaf(path, f"has {len(a)} in A, {len(b)} in B")
         for index, (one, other) in enumerate(zip(a, b, strict=False)):
-            yield from _leaves(one, other, f"{path}[{index}]", seen, depth + 1)
+            yield from _leaves(one, other, f"{path}[{index}]", within, depth + 1)
     elif type(a) is type(b) and is_dataclass(a) and not isinstance(a, type):
         for part in fields(a):
             one, other = getattr(a, part.name), getattr(b, part.name)
-            yield from _leaves(one, other, f"{path}.{part.name}", seen, depth + 1)
+            yield from _leaves(one, other, f"{path}.{part.name}", within, depth + 1)
     elif not _equal(a, b):
         if type(a) is type(b) and hasattr(a, "__dict__") and "__eq__" not in vars(type(a)):
             # Its own idea of equality is to be the very same object: what it holds decides.
-            yield from _leaves(vars(a), vars(b), path, seen, depth + 1)
+            yield from _leaves(vars(a), vars(b), path, within, depth + 1)
         else:
             yield _Leaf(path, f"{_short(a)} in A, {_short(b)} in B")
 

@@ -28,7 +28,7 @@ from workbench.stage import (
 )
 
 if TYPE_CHECKING:
-    from workbench.recording import Frame
+    from workbench.recording import Camera, Frame
 
 S = TypeVar("S", bound=Artifact)
 
@@ -182,6 +182,10 @@ class Pipeline:
         """The digest of each stage's code."""
         return dict(self._code)
 
+    def resource_digests(self) -> dict[str, str]:
+        """The digest of each resource that was given."""
+        return {name: digest for name, (_, digest) in self.resources.items()}
+
     def run(self, frame: Frame) -> Run:
         """The frame through all stages.  A stage's exception never hides the others' results."""
         return deque(self.steps(frame), maxlen=1).pop()
@@ -280,9 +284,7 @@ class Pipeline:
             recorded = frame.cameras.get(camera.channel)
             if recorded is not None:
                 artifacts[camera.name] = recorded
-                digests[camera.name] = digest_of(
-                    [recorded.width, recorded.height, recorded.K, recorded.D]
-                )
+                digests[camera.name] = _digest_of_camera(recorded)
         for name, (value, digest) in self.resources.items():
             artifacts[name] = value
             digests[name] = digest
@@ -423,6 +425,12 @@ def _bytes_of(value: Any, seen: set[int]) -> int:
     if is_dataclass(value) and not isinstance(value, type):
         return sum(_bytes_of(getattr(value, f.name), seen) for f in fields(value))
     return 0
+
+
+def _digest_of_camera(camera: Camera) -> str:
+    """All that a stage may take from it but its stamp, which each message has anew."""
+    model, frame_id = camera.distortion_model, camera.frame_id
+    return digest_of([camera.width, camera.height, camera.K, camera.D, model, frame_id])
 
 
 def _load(need: Resource, path: Path) -> tuple[Any, str]:

@@ -9,11 +9,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
 
-from workbench.digest import digest_of_file
+from workbench.digest import STAGES, digest_of_file
 from workbench.errors import one_line
 from workbench.stage import Artifact, Stage, StageError
 
-GROUP = "workbench.stages"
+GROUP = STAGES
 
 
 def find_stages(files: Sequence[Path] = ()) -> dict[str, Stage]:

@@ -112,6 +112,8 @@ class RunReport:
 
     def as_dict(self) -> dict[str, Any]:
         """All of it as JSON values; what is not a number is None."""
+        # First, for a scorer that fails to sum up is one of the failures.
+        scores = self.scores()
         return {
             "recording": self.session.recording.path.name,
             "frames": self.frames,
@@ -127,8 +129,7 @@ class RunReport:
             ],
             "warnings": [{"says": says, "frames": count} for says, count in self.warnings.items()],
             "scores": {
-                stage: [finite(asdict(score)) for score in scores]
-                for stage, scores in self.scores().items()
+                stage: [finite(asdict(score)) for score in own] for stage, own in scores.items()
             },
             "provenance": self.session.provenance(),
         }

@@ -21,7 +21,14 @@ from workbench.recording import Recording
 from workbench.settings import resolve
 from workbench.stage import RecordedImage, Resource, Stage
 
-_IDENTIFIED_LIBRARIES = ("numpy", "opencv-python-headless", "numba", "rerun-sdk")
+_IDENTIFIED_LIBRARIES = (
+    "numpy",
+    "opencv-python-headless",
+    "scipy",
+    "scikit-image",
+    "numba",
+    "rerun-sdk",
+)
 
 
 @dataclass(frozen=True)

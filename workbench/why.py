@@ -501,8 +501,8 @@ def _narrowed(hits: _Hits, trials: _Trials) -> Iterator[_Hit]:
         axis, way = widest.axis, 1 if outside > 0 else -1
         # A place beyond the range's end stands for the end.
         far = min(abs(outside), axis.places(widest.share) + 1) if outside else 0
-        hit, near = widest, abs(inside)
-        if hit.share > best.share:
+        near = abs(inside)
+        if widest.share > best.share:
             # Only what would be less than the best so far is of interest.
             limit = min(axis.places(best.share), far)
             while limit > near and axis.share(axis.at(way * limit)) >= best.share:
@@ -510,17 +510,19 @@ def _narrowed(hits: _Hits, trials: _Trials) -> Iterator[_Hit]:
             nearer = turned(axis, way * limit) if limit > near else None
             if nearer is None:
                 continue
-            hit, far = nearer, limit
+            best, far = nearer, limit
+            yield best
         while far - near > 1:
             middle = (near + far) // 2
             nearer = turned(axis, way * middle)
             if nearer is None:
                 near = middle
             else:
-                hit, far = nearer, middle
-        if hit.share < best.share:
-            best = hit
-            yield best
+                far = middle
+                # At the range's end two places may stand for one value.
+                if nearer.share < best.share:
+                    best = nearer
+                    yield best
 
 
 def _verified(pipeline: Pipeline, run: Run, x: int, y: int, stage: str, hit: _Hit) -> Change | None:
@@ -557,7 +559,11 @@ def outcome(search: Search | None) -> str:
         f"{change.before} ({_percent(change.share)} of its range) `{search.stage}` says "
         f"**{change.verdict}** instead of **{search.verdict}**: {change.says} ({tried})."
     )
-    return f"S{found}" if search.instead is None else f"{nothing}. In an earlier stage the s{found}"
+    if search.instead is not None:
+        return f"{nothing}. In an earlier stage the s{found}"
+    if not search.complete:
+        return f"The search was ended early. Until then the s{found}"
+    return f"S{found}"
 
 
 def _percent(share: float) -> str:

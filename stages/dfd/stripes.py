@@ -70,14 +70,21 @@ def measure_stripes(image: np.ndarray) -> Stripes | None:
     frequency = np.hypot(fx, fy)
     lowest = 1 / (min(height, width) * _LONGEST_PERIOD_SHARE)
     allowed = (frequency >= lowest) & (frequency <= 1 / _SHORTEST_PERIOD_PX)
-    total = float(power[allowed].sum())
+    # Half of the plane stands for all of it: every column but the first and, of an even width, the
+    # last holds its mirror image as well.
+    weight = np.full(fx.shape, 2.0)
+    weight[0, 0] = 1
+    weight[0, -1] = 2 if width % 2 else 1
+    total = float((weight * power)[allowed].sum())
     if total <= 0 or not math.isfinite(total):
         return None
     row, column = np.unravel_index(np.argmax(np.where(allowed, power, 0)), power.shape)
-    near_peak = (np.abs(fx - fx[0, column]) * width <= _PEAK_HALF_WIDTH) & (
-        np.abs((fy - fy[row, 0] + 0.5) % 1 - 0.5) * height <= _PEAK_HALF_WIDTH
+    near_peak, near_mirror = (
+        (np.abs(fx - sign * fx[0, column]) * width <= _PEAK_HALF_WIDTH)
+        & (np.abs((fy - sign * fy[row, 0] + 0.5) % 1 - 0.5) * height <= _PEAK_HALF_WIDTH)
+        for sign in (1, -1)
     )
-    strength = float(power[near_peak & allowed].sum()) / total
+    strength = float((weight * power)[(near_peak | near_mirror) & allowed].sum()) / total
     if strength < _PEAK_SHARE or power[near_peak].max() > power[row, column]:
         return None
     along_y = np.log(power[[row - 1, row, (row + 1) % height], column] + 1e-30)

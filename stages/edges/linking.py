@@ -760,9 +760,9 @@ def _link_round(
             room_y = h - 2 - y0 if dy > 0 else y0 - 1
             adx = abs(dx)
             ady = abs(dy)
-            if np.float32(room_x) * ady <= np.float32(room_y) * adx:
+            if adx > 0 and np.float32(room_x) * ady <= np.float32(room_y) * adx:
                 gone_x = room_x
-                gone_y = int(np.float32(room_x) * ady / adx + np.float32(0.5)) if adx > 0 else 0
+                gone_y = int(np.float32(room_x) * ady / adx + np.float32(0.5))
             else:
                 gone_y = room_y
                 gone_x = int(np.float32(room_y) * adx / ady + np.float32(0.5))

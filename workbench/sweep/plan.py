@@ -15,7 +15,7 @@ from typing import Any
 
 from workbench.digest import digest_of
 from workbench.pipeline import Pipeline
-from workbench.session import Options, library_versions
+from workbench.session import Options, Session, library_versions
 from workbench.settings import Settings
 from workbench.stage import Stage
 from workbench.sweep.axes import Cell
@@ -43,6 +43,9 @@ class Job:
     picture_frames: tuple[frozenset[int], ...]
     """Of each recording, the frames of which pictures are kept."""
     code: Mapping[str, str]
+    resources: tuple[Mapping[str, str], ...]
+    """Of each recording, the digest of each of its resources."""
+    libraries: Mapping[str, str]
     digest: str = field(default="", compare=False)
 
     def identified(self) -> str:
@@ -55,6 +58,8 @@ class Job:
                 repr(sorted(self.base.items())),
                 str(self.picture_stage),
                 repr([sorted(frames) for frames in self.picture_frames]),
+                repr(sorted(self.code.items())),
+                repr([sorted(own.items()) for own in self.resources]),
             ]
         )
 
@@ -78,6 +83,14 @@ class Block:
     start: int
     stop: int
     cells: tuple[Cell, ...]
+
+
+def source_of(session: Session) -> str:
+    """What identifies a session's frames: the recording's bytes and the topics read from it."""
+    topics = session.recording.channel_topics
+    required, optional = session.pipeline.channels
+    read = {name: topic for name, topic in topics.items() if name in (*required, *optional)}
+    return digest_of([session.recording.digest, *sorted(read.items())])
 
 
 def result_keys(pipeline: Pipeline, settings: Settings) -> dict[str, str]:

@@ -17,7 +17,7 @@ from workbench.errors import DataError, UsageError
 from workbench.files import replacing
 from workbench.pipeline import ResultStore
 from workbench.plugins import find_stages
-from workbench.session import Options, Session
+from workbench.session import Options, Session, library_versions
 from workbench.settings import Settings, adjusted, to_toml
 from workbench.stage import Better, Stage
 from workbench.sweep.analysis import Choice, choose
@@ -25,7 +25,15 @@ from workbench.sweep.axes import Cell, Grid, grid
 from workbench.sweep.cache import Cache
 from workbench.sweep.engines import default_workers, outcomes
 from workbench.sweep.pictures import can_draw
-from workbench.sweep.plan import Block, Job, blocks_of, in_tree_order, result_keys, tasks_of
+from workbench.sweep.plan import (
+    Block,
+    Job,
+    blocks_of,
+    in_tree_order,
+    result_keys,
+    source_of,
+    tasks_of,
+)
 from workbench.sweep.results import STABILITY, Reader, add_stability, frame_rows, mean_ms
 from workbench.sweep.table import Metric, Row, write_cells, write_frames
 
@@ -225,15 +233,14 @@ def _job(
     )
     job = Job(
         tuple(path.absolute() for path in request.recordings),
-        tuple(
-            digest_of([session.recording.digest, *sorted(_topics(session).items())])
-            for session in sessions
-        ),
+        tuple(source_of(session) for session in sessions),
         plain,
         dict(pipeline.settings.changed),
         _picture_stage(pipeline.stages, asked) if request.pictures else None,
         tuple(_spread(spans, request.pictures)),
         pipeline.code_digests(),
+        tuple(session.pipeline.resource_digests() for session in sessions),
+        dict(library_versions()),
     )
     return replace(job, digest=job.identified())
 
@@ -249,12 +256,6 @@ def _picture_stage(
         if asked and stage.name == asked[0][0].partition(".")[0]:
             break
     return shown
-
-
-def _topics(session: Session) -> dict[str, str]:
-    required, optional = session.pipeline.channels
-    topics = session.recording.channel_topics
-    return {name: topic for name, topic in topics.items() if name in (*required, *optional)}
 
 
 def _spread(spans: Sequence[tuple[int, int]], count: int) -> Iterator[frozenset[int]]:
@@ -276,9 +277,7 @@ def _keys(
     found: dict[tuple[tuple[str, str], ...], dict[int, dict[str, str]]] = {}
     result = []
     for session in sessions:
-        resources = tuple(
-            sorted((name, digest) for name, (_, digest) in session.pipeline.resources.items())
-        )
+        resources = tuple(sorted(session.pipeline.resource_digests().items()))
         if resources not in found:
             found[resources] = {
                 cell.index: result_keys(session.pipeline, adjusted(stages, settings, cell.values))
@@ -324,9 +323,9 @@ def _compute(
     if advance is not None:
         advance(done, total)
     started = time.perf_counter()
-    source_of = {task.number: job.sources[task.recording] for task in tasks}
+    sources = {task.number: job.sources[task.recording] for task in tasks}
     for outcome in outcomes(job, tasks, workers, request.scheduler):
-        cache.put(source_of[outcome.task], outcome.seen, outcome.kept)
+        cache.put(sources[outcome.task], outcome.seen, outcome.kept)
         if not spent.workers:
             look()
         spent.workers += outcome.seconds
@@ -390,6 +389,8 @@ def _finished(
         sorted(set(range(start, stop)) & cache.readable(source))
         for source, (start, stop) in zip(job.sources, spans, strict=True)
     ]
+    if not any(frames):
+        raise DataError(f"{request.recordings[0]}: no frame that can be read")
     metrics: dict[str, Metric] = {}
     rows: dict[int, Row] = {}
     for cell in in_tree_order(cells, pipeline.stages):

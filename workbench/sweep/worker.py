@@ -19,12 +19,12 @@ import numpy as np
 from workbench.errors import DataError, one_line
 from workbench.pipeline import Pipeline, ResultStore, Run
 from workbench.plugins import find_stages
-from workbench.session import Session
+from workbench.session import Session, library_versions
 from workbench.settings import Settings, adjusted
 from workbench.stage import Stage
 from workbench.sweep.cache import Kept, packed
 from workbench.sweep.pictures import drawn, outline_of
-from workbench.sweep.plan import Job, Task, result_keys, upstream
+from workbench.sweep.plan import Job, Task, result_keys, source_of, upstream
 
 _STORE_BYTES = 512 << 20
 _OPEN_SESSIONS = 2
@@ -96,12 +96,7 @@ def _open(job: Job, recording: int) -> _Opened:
         return _opened[where]
     options = replace(job.options, recording=job.recordings[recording])
     session = Session.open(options, ResultStore(_STORE_BYTES))
-    for name, digest in session.pipeline.code_digests().items():
-        if job.code.get(name) != digest:
-            raise DataError(
-                f"a worker has other code of stage {name} than this machine; expected digest "
-                f"{job.code.get(name)}, found {digest}"
-            )
+    _check_alike(job, recording, session)
     stages = session.pipeline.stages
     before = upstream(stages)
     given = {stage.name: {a.name for a in stage.gives} for stage in stages}
@@ -120,6 +115,23 @@ def _open(job: Job, recording: int) -> _Opened:
     while len(_opened) > _OPEN_SESSIONS:
         _opened.popitem(last=False)
     return _opened[where]
+
+
+def _check_alike(job: Job, recording: int, session: Session) -> None:
+    """Raise :class:`DataError` unless all that results depend on is what the parent has."""
+    pipeline, recorded = session.pipeline, session.recording.path.name
+    for what, expected, found in (
+        ("code of stage", job.code, pipeline.code_digests()),
+        ("version of", job.libraries, library_versions()),
+        ("file of", job.resources[recording], pipeline.resource_digests()),
+        ("recording", {recorded: job.sources[recording]}, {recorded: source_of(session)}),
+    ):
+        for name in sorted(expected.keys() | found.keys()):
+            if expected.get(name) != found.get(name):
+                raise DataError(
+                    f"a worker has another {what} {name} than this machine; expected "
+                    f"{expected.get(name)}, found {found.get(name)}"
+                )
 
 
 def _work(opened: _Opened, job: Job, task: Task, start: float) -> Outcome:
