@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 import pytest
 import rooms
 from mcap_fixtures import PERIOD_NS, START_NS, Recorder
+from waiting import PATIENCE_S
 
 from workbench.recording import Frame, Recording
 
@@ -90,6 +91,26 @@ def chromium() -> str | None:
         own = playwright.chromium.executable_path
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     return own if Path(own).is_file() else next(filter(None, map(shutil.which, names)), None)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A Chromium for the pages of a test file; it keeps what it compiled of the viewer.
+
+    Not for the whole session: Playwright leaves its event loop running in this thread.
+    """
+    from playwright.sync_api import sync_playwright
+
+    flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch_persistent_context(
+            tmp_path_factory.mktemp("chromium"),
+            executable_path=chromium(),
+            args=[*flags, "--enable-unsafe-swiftshader"],
+        )
+        opened.set_default_timeout(PATIENCE_S * 1e3)
+        yield opened
+        opened.close()
 
 
 def missing_vulkan() -> str:

@@ -3,54 +3,25 @@
 from __future__ import annotations
 
 import re
-import shutil
 import signal
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from waiting import PATIENCE_S, until, until_running
 
 from workbench.teach import find_lessons
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = [pytest.mark.browser, pytest.mark.process]
 
-FLAGS = (
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
 # Software rendering pays for each pixel.
-SIZE = {"width": 900, "height": 500}
-SECONDS = 60.0
+SIZE = {"width": 760, "height": 440}
 # The viewer would tell its maker that it runs; the page does not let it, and the viewer complains.
 OUTSIDE = re.compile(r"tel\.rerun\.io|Failed to fetch")
-
-
-@pytest.fixture
-def tab() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        own = Path(playwright.chromium.executable_path)
-        found = str(own) if own.is_file() else shutil.which("chromium") or shutil.which("chrome")
-        if found is None:
-            pytest.skip("there is no Chromium (playwright install chromium, or the system's)")
-        browser = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        page = browser.new_page(viewport=SIZE)
-        page.set_default_timeout(SECONDS * 1e3)
-        yield page
-        browser.close()
-
-
-def until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + SECONDS
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.2)
 
 
 def drawn(page: Any) -> bool:
@@ -62,14 +33,16 @@ def drawn(page: Any) -> bool:
 
 
 def test_the_course_runs_through_in_a_browser(
-    tab: Any, started: Callable[..., subprocess.Popen[str]], tmp_path: Path
+    browser: Any, started: Callable[..., subprocess.Popen[str]], tmp_path: Path
 ) -> None:
     errors: list[str] = []
+    tab = browser.new_page()
+    tab.set_viewport_size(SIZE)
     tab.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
     tab.on("pageerror", lambda error: errors.append(str(error)))
     child = started("teach", "--no-browser")
     told = tmp_path / "stderr"
-    until(lambda: "serving" in told.read_text(), "the page is served")
+    until_running(child, lambda: "serving" in told.read_text(), told)
     address = re.search(r"http://127\.0\.0\.1:\S+", told.read_text())
     assert address is not None
     tab.goto(address.group(0))
@@ -96,7 +69,7 @@ def test_the_course_runs_through_in_a_browser(
     until(lambda: tab.locator(".knob.changed").count() == 0, "undone")
     assert [error for error in errors if not OUTSIDE.search(error)] == []
     child.send_signal(signal.SIGINT)
-    assert child.wait(30) == 0
+    assert child.wait(PATIENCE_S) == 0
 
 
 def stands(claim: Any) -> bool:

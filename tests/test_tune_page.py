@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import shutil
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,75 +16,71 @@ import cv2
 import numpy as np
 import pytest
 from conftest import Command
+from waiting import PATIENCE_S, until, until_running
 
 import workbench
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = [pytest.mark.browser, pytest.mark.process]
 
-FLAGS = (
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
 # Software rendering pays for each pixel.
-SIZE = {"width": 1100, "height": 620}
-SECONDS = 60.0
+SIZE = {"width": 1000, "height": 560}
 
 
-def chromium(playwright: Any) -> str:
-    """A Chromium to use, or a skipped test."""
-    own = Path(playwright.chromium.executable_path)
-    found = str(own) if own.is_file() else shutil.which("chromium") or shutil.which("chrome")
-    if found is None:
-        pytest.skip("there is no Chromium (playwright install chromium, or the system's)")
-    return found
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with sync_api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=chromium(playwright), args=list(FLAGS))
-        yield opened
-        opened.close()
-
-
-@dataclass
 class Host:
-    """The program that serves the page."""
+    """The program that serves the page, for as long as the tests of this file take."""
 
-    child: subprocess.Popen[str]
-    url: str
-    artifacts: Path
-    recording: Path
+    def __init__(self, folder: Path, like: Path) -> None:
+        self.recording, self.artifacts = folder / "scene.mcap", folder / "live.npz"
+        for file in like.parent.iterdir():
+            target = self.recording if file.suffix == ".mcap" else folder / file.name
+            target.write_bytes(file.read_bytes())
+        with (folder / "stdout").open("w") as out:
+            self.child = subprocess.Popen(
+                [
+                    *(sys.executable, Path(__file__).with_name("tune_host.py")),
+                    *(self.recording, self.artifacts),
+                ],
+                stdout=out,
+                text=True,
+                cwd=folder,
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+            )
+        said = folder / "stdout"
+        until_running(self.child, lambda: said.read_text().endswith("\n"))
+        self.url = said.read_text().strip()
 
-    def end(self) -> dict[str, np.ndarray]:
-        """Ctrl-C; returns the artifacts that were live."""
-        self.child.send_signal(signal.SIGINT)
-        assert self.child.wait(30) == 0
+    def live(self) -> dict[str, np.ndarray]:
+        """The artifacts as they are now."""
+        self.artifacts.unlink(missing_ok=True)
+        self.child.send_signal(signal.SIGUSR1)
+        until_running(self.child, self.artifacts.exists)
         with np.load(self.artifacts) as saved:
             return dict(saved)
 
 
+@pytest.fixture(scope="module")
+def host(tmp_path_factory: pytest.TempPathFactory, twins: dict[str, Path]) -> Iterator[Host]:
+    made = Host(tmp_path_factory.mktemp("host"), twins["protobuf"])
+    yield made
+    made.child.send_signal(signal.SIGINT)
+    try:
+        assert made.child.wait(PATIENCE_S) == 0
+    finally:
+        made.child.kill()
+
+
+@pytest.fixture(scope="module")
+def opened(browser: Any, host: Host) -> Tab:
+    page = browser.new_page()
+    page.set_viewport_size(SIZE)
+    return Tab(page, host.url)
+
+
 @pytest.fixture
-def host(tmp_path: Path, twins: dict[str, Path]) -> Iterator[Host]:
-    recording = tmp_path / "scene.mcap"
-    for file in twins["protobuf"].parent.iterdir():
-        target = recording if file.suffix == ".mcap" else tmp_path / file.name
-        target.write_bytes(file.read_bytes())
-    artifacts = tmp_path / "live.npz"
-    child = subprocess.Popen(
-        [sys.executable, Path(__file__).with_name("tune_host.py"), recording, artifacts],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd=tmp_path,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    assert child.stdout is not None
-    yield Host(child, child.stdout.readline().strip(), artifacts, recording)
-    child.kill()
-    child.wait()
-    child.stdout.close()
+def tab(opened: Tab) -> Tab:
+    """The one page on which all of this file's tests are done, as it is at the start."""
+    opened.begin_anew()
+    return opened
 
 
 class Tab:
@@ -93,9 +88,19 @@ class Tab:
 
     def __init__(self, page: Any, url: str) -> None:
         self.page = page
-        page.set_default_timeout(SECONDS * 1e3)
         page.goto(url)
         self.wait_for_viewer()
+
+    def begin_anew(self) -> None:
+        """All stages of the first frame, with the default settings and the knobs folded."""
+        for head in self.page.locator(".q-expansion-item--expanded .stage-name").all():
+            head.click()
+        self.page.get_by_role("button", name="All stages").click()
+        self.page.evaluate("emitEvent('bench_restore', 'preset=default&frame=0&view=live&focus=')")
+        until(
+            lambda: not re.search("[?&](set|focus|frame|view)=", self.address or "&set="),
+            "it is reset",
+        )
 
     def wait_for_viewer(self) -> None:
         self.page.wait_for_function(
@@ -105,9 +110,11 @@ class Tab:
     @property
     def address(self) -> str:
         """The page's address as it is now; Playwright's own is that of the last event it saw."""
+        from playwright.sync_api import Error
+
         try:
             return str(self.page.evaluate("location.href"))
-        except sync_api.Error:
+        except Error:
             # The page is loading again, as it does after a long stall.
             return ""
 
@@ -140,42 +147,72 @@ class Tab:
             self.page.mouse.move(start + (stop - start) * k / steps, y)
         self.page.mouse.up()
 
-    def picture(self) -> np.ndarray:
-        """The viewer's canvas as it is at rest."""
+    def picture(
+        self, fits: Callable[[np.ndarray], bool] = lambda _: True, what: str = ""
+    ) -> np.ndarray:
+        """The viewer's canvas when it is at rest, and is as it is awaited."""
         self.page.mouse.move(5, 5)
-        # A message lies over the canvas for some seconds.
-        self.page.wait_for_function("!document.querySelector('.q-notification')")
         before = b""
-        for _ in range(40):
-            now = self.page.locator("#viewer").screenshot()
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            # Messages lie over the canvas for some seconds.
+            now = self.page.locator("#viewer").screenshot(
+                style=".q-notification { display: none !important }"
+            )
             if now == before:
-                break
+                found = cv2.imdecode(np.frombuffer(now, np.uint8), cv2.IMREAD_COLOR).astype(float)
+                if fits(found):
+                    return found
+                assert time.monotonic() < deadline, what
             before = now
-            time.sleep(0.3)
-        return cv2.imdecode(np.frombuffer(now, np.uint8), cv2.IMREAD_COLOR).astype(float)
-
-    def until(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + SECONDS
-        while not condition():
-            assert time.monotonic() < deadline, what
-            time.sleep(0.1)
+            self.page.wait_for_timeout(150)
 
     def says(self, text: str) -> None:
         """Wait for a message on the page."""
         self.page.locator(f".q-notification:has-text('{text}')").first.wait_for()
 
+    def wait_for_layout(self) -> None:
+        """Until the canvas has its place and the viewer draws as large as it is there."""
+        self.page.evaluate("window.benchPlace = ''")
+        self.page.wait_for_function(
+            """() => {
+                const canvas = document.getElementById('viewer');
+                const box = canvas.getBoundingClientRect();
+                const place = [box.x, box.y, box.width, box.height, canvas.width].join();
+                const still = place === window.benchPlace;
+                window.benchPlace = place;
+                return still && Math.abs(canvas.width - box.width * devicePixelRatio) < 2;
+            }""",
+            polling=150,
+        )
+
     def click_pixel(self, at: tuple[float, float]) -> tuple[int, int]:
         """Click at shares of the canvas; returns the pixel whose story is told."""
-        box = self.page.locator("#viewer").bounding_box()
         title = self.page.locator(".story-head .story-title")
-        before = title.inner_text() if title.is_visible() else ""
-        for _ in range(4):
-            self.page.mouse.click(box["x"] + at[0] * box["width"], box["y"] + at[1] * box["height"])
-            # The canvas may become narrower for the story; the next click must find it at rest.
-            self.page.wait_for_timeout(2500)
-            if title.is_visible() and title.inner_text() != before:
-                break
-        x, y = title.inner_text().removeprefix("Why pixel ").split(", ")
+
+        def told() -> str:
+            return title.inner_text() if title.is_visible() else ""
+
+        before = told()
+        asked = -np.inf
+
+        def answered() -> bool:
+            nonlocal asked
+            # While the picture is drawn anew a click may be lost.
+            if time.monotonic() - asked > 3:
+                self.wait_for_layout()
+                box = self.page.locator("#viewer").bounding_box()
+                x, y = (
+                    box[k] + share * box[s]
+                    for k, s, share in zip("xy", ("width", "height"), at, strict=True)
+                )
+                self.page.mouse.click(x, y)
+                asked = time.monotonic()
+            return told() not in ("", before)
+
+        until(answered, "a pixel's story is told")
+        self.wait_for_layout()
+        x, y = told().removeprefix("Why pixel ").split(", ")
         return int(x), int(y)
 
 
@@ -184,39 +221,37 @@ def differ(a: np.ndarray, b: np.ndarray) -> int:
     return int((np.abs(a - b).max(axis=2) > 40).sum())
 
 
-def test_a_session_of_tuning(browser: Any, host: Host, bench: Command, tmp_path: Path) -> None:
-    tab = Tab(browser.new_page(viewport=SIZE), host.url)
+def test_a_session_of_tuning(tab: Tab, host: Host, bench: Command, tmp_path: Path) -> None:
     assert "token" not in tab.address
     tab.open_stage("linked_edges")
-    tab.until(lambda: "focus=linked_edges" in tab.address, "the address follows")
+    until(lambda: "focus=linked_edges" in tab.address, "the address follows")
     first = tab.picture()
     tab.page.get_by_role("button", name="Pin as A").click()
 
     # A drag changes the picture, and nothing upstream runs again.
     tab.drag("min_weight", 1.0)
-    tab.until(lambda: "min_weight%3D100" in tab.address, "the drag arrives")
-    tab.until(lambda: tab.stages()["linked_edges"] == "ran", "the stage ran")
+    until(lambda: "min_weight%3D100" in tab.address, "the drag arrives")
+    until(lambda: tab.stages()["linked_edges"] == "ran", "the stage ran")
     upstream = ("registration", "focus_maps", "depth_cloud", "edge_stack")
     assert [tab.stages()[name] for name in upstream] == ["kept"] * 4
-    second = tab.picture()
-    assert differ(first, second) > 300
+    second = tab.picture(lambda seen: differ(first, seen) > 300, "the picture changes")
     tab.page.get_by_role("button", name="Pin as B").click()
 
     # Undo, by the keyboard, brings back both the value and the picture; a whole drag is one step.
     tab.page.keyboard.press("Control+z")
-    tab.until(lambda: "min_weight" not in tab.address.partition("pinA")[0], "the value is back")
-    tab.until(lambda: differ(first, tab.picture()) < 30, "the picture is back")
+    until(lambda: "min_weight" not in tab.address.partition("pinA")[0], "the value is back")
+    tab.picture(lambda seen: differ(first, seen) < 30, "the picture is back")
 
     # A and B are flipped in place.
     views = tab.page.locator(".views button")
     views.nth(2).click()
-    tab.until(lambda: differ(second, tab.picture()) < 30, "B is shown")
+    tab.picture(lambda seen: differ(second, seen) < 30, "B is shown")
     views.nth(1).click()
-    tab.until(lambda: differ(first, tab.picture()) < 30, "A is shown")
+    tab.picture(lambda seen: differ(first, seen) < 30, "A is shown")
     views.nth(4).click()
-    tab.until(lambda: min(differ(p, tab.picture()) for p in (first, second)) > 1000, "B less A")
+    tab.picture(lambda seen: min(differ(p, seen) for p in (first, second)) > 1000, "B less A")
     views.nth(0).click()
-    tab.until(lambda: differ(first, tab.picture()) < 30, "now is shown")
+    tab.picture(lambda seen: differ(first, seen) < 30, "now is shown")
 
     # The first click opens the story beside the canvas; two more tell how the picture lies on it
     # now, and the next asks for an edge's pixel.
@@ -242,17 +277,18 @@ def test_a_session_of_tuning(browser: Any, host: Host, bench: Command, tmp_path:
     assert "cone_deg" not in tab.address
     field.fill("41.5")
     field.press("Enter")
-    tab.until(lambda: "cone_deg%3D41.5" in tab.address, "what was typed is taken")
+    until(lambda: "cone_deg%3D41.5" in tab.address, "what was typed is taken")
+    until(lambda: tab.stages()["linked_edges"] == "ran", "the stage ran")
     tab.page.get_by_role("button", name="Save").click()
     tab.page.locator(".save").get_by_role("button", name="Save").click()
     refused = tab.page.locator(".save .refused")
-    tab.until(lambda: "reason" in refused.inner_text(), "a reason is asked for")
+    until(lambda: "reason" in refused.inner_text(), "a reason is asked for")
     tab.page.locator(".save textarea").fill("the cone let in what lies beside")
     tab.page.locator(".save").get_by_role("button", name="Save").click()
-    tuned = tmp_path / "scene.tuned.toml"
-    tab.until(tuned.is_file, "it is saved")
+    tuned = host.recording.with_name("scene.tuned.toml")
+    until(tuned.is_file, "it is saved")
     assert "the cone let in" in tuned.read_text()
-    live = host.end()
+    live = host.live()
     ended = bench(
         "export", host.recording, "--config", tuned, "--frames", "0:1", "--to", tmp_path / "out"
     )
@@ -266,47 +302,61 @@ def test_a_session_of_tuning(browser: Any, host: Host, bench: Command, tmp_path:
             assert exported[name].tobytes() == live[name].tobytes(), name
 
 
-def test_what_goes_wrong_is_told_and_survived(browser: Any, host: Host) -> None:
-    context = browser.new_context(viewport=SIZE)
-    tab = Tab(context.new_page(), host.url + "&set=linked_edges.cone_deg%3D400")
-    tab.says("linked_edges.cone_deg")
-    assert "cone_deg" not in tab.address
-    tab.page.goto(host.url + "&set=linked_edges.nothing%3D1")
-    tab.says("no parameter")
-    tab.wait_for_viewer()
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [("cone_deg%3D400", "linked_edges.cone_deg"), ("nothing%3D1", "no parameter")],
+)
+def test_an_address_that_cannot_be_is_told(browser: Any, host: Host, asked: str, says: str) -> None:
+    page = browser.new_page()
+    page.goto(f"{host.url}&set=linked_edges.{asked}")
+    page.locator(f".q-notification:has-text('{says}')").first.wait_for()
+    until(lambda: asked not in page.evaluate("location.href"), "the address is as it was")
+    page.close()
 
-    # A value out of range and half a number are refused, and the field shows what is.
+
+def test_what_is_typed_wrongly_is_refused_and_the_field_shows_what_is(tab: Tab) -> None:
+    """A value out of range, and half a number."""
     tab.open_stage("linked_edges")
     field = tab.knob("reach").locator("input")
     for typed, says in (("1000", "linked_edges.reach"), ("1.2.3", "expected a number")):
         field.fill(typed)
         field.press("Enter")
         tab.says(says)
-        tab.until(lambda: field.input_value() == "15", "the value stays")
+        until(lambda: field.input_value() == "15", "the value stays")
 
-    # A second tab shows the same state, live.
-    other = Tab(context.new_page(), tab.page.url)
+
+def test_a_second_tab_shows_the_same_state_live(browser: Any, tab: Tab) -> None:
+    other = browser.new_page()
+    other.goto(tab.address)
     tab.page.bring_to_front()
+    tab.open_stage("linked_edges")
     tab.drag("reach", 1.0)
-    other.until(lambda: "reach%3D60" in other.address, "the other tab follows")
-    other.page.close()
+    until(lambda: "reach%3D60" in other.evaluate("location.href"), "the other tab follows")
+    other.close()
 
-    # A connection that is lost comes again, with its pictures.
+
+def test_a_connection_that_is_lost_comes_again_with_its_pictures(tab: Tab) -> None:
     tab.page.evaluate("bench.drop()")
     tab.wait_for_viewer()
-    assert tab.picture().std() > 10
+    tab.picture(lambda seen: bool(seen.std() > 10), "there are pictures")
 
-    # A recording that is gone: what is kept is shown, what is not is told, the page lives on.
+
+def test_a_recording_that_is_gone_is_told_and_survived(tab: Tab, host: Host) -> None:
+    """What is kept is shown, what is not is told, the page lives on."""
     box = tab.page.locator(".frames").bounding_box()
     y = box["y"] + box["height"] / 2
     label = tab.page.locator(".frame-label")
     tab.page.mouse.click(box["x"] + box["width"] - 2, y)
-    tab.until(lambda: "frame 2" in label.inner_text(), "the last frame is shown")
+    until(lambda: "frame 2" in label.inner_text(), "the last frame is shown")
+    kept = host.recording.read_bytes()
     host.recording.unlink()
-    tab.page.mouse.click(box["x"] + box["width"] / 2, y)
-    banner = tab.page.locator(".banner")
-    banner.wait_for()
-    assert "scene.mcap: frame 1 cannot be read" in banner.inner_text()
-    tab.page.mouse.click(box["x"] + 2, y)
-    banner.wait_for(state="hidden")
-    assert json.loads(tab.page.evaluate("JSON.stringify(bench.pieces() > 0)"))
+    try:
+        tab.page.mouse.click(box["x"] + box["width"] / 2, y)
+        banner = tab.page.locator(".banner")
+        banner.wait_for()
+        assert "scene.mcap: frame 1 cannot be read" in banner.inner_text()
+        tab.page.mouse.click(box["x"] + 2, y)
+        banner.wait_for(state="hidden")
+        assert json.loads(tab.page.evaluate("JSON.stringify(bench.pieces() > 0)"))
+    finally:
+        host.recording.write_bytes(kept)
