@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from face_scenes import CAMERA, ELL, RECTANGLE, Scene, plate_and_ell
+from stage_outputs import given as whole
 
 from workbench.errors import DataError
 from workbench.stage import WARNINGS, Logged
@@ -57,7 +58,7 @@ class Pile:
         self.stranger = scene.add(RECTANGLE * 1.15, 10.0, (0.035, 0.035, 0.785))
         self.parameters = Recognition.Parameters(**parameters)
         self.artifacts = inputs_of(scene, database)
-        self.artifacts |= Recognition().compute(self.artifacts, self.parameters)
+        self.artifacts |= whole(Recognition(), self.artifacts, self.parameters)
         self.artifacts |= PoseFrames().compute(self.artifacts, PoseFrames.Parameters())
 
     def at(self, label: int) -> tuple[int, int]:
@@ -100,7 +101,7 @@ def test_without_models_depth_or_camera_there_is_no_verdict(
     scene = Scene()
     scene.add(RECTANGLE, 0.0)
     given = inputs_of(scene, database) | {missing: None}
-    found = Recognition().compute(given, Recognition.Parameters())
+    found = whole(Recognition(), given, Recognition.Parameters())
     assert found["verdict"] is None and len(found["candidates"]) == 0
     given |= found
     assert PoseFrames().compute(given, PoseFrames.Parameters())["poses"] == []
@@ -115,20 +116,20 @@ def test_models_of_another_calibration_are_refused(database: Database) -> None:
     scene = Scene()
     scene.add(RECTANGLE, 0.0)
     given = inputs_of(scene, bound) | {"calibration": seen_with}
-    assert Recognition().compute(given, Recognition.Parameters())["verdict"]["verdict"] == "pick"
+    assert whole(Recognition(), given, Recognition.Parameters())["verdict"]["verdict"] == "pick"
     given["calibration"] = SimpleNamespace(curve=seen_with.curve, near_z_m=0.71, far_z_m=0.8)
     with pytest.raises(DataError, match="models were trained with calibration"):
-        Recognition().compute(given, Recognition.Parameters())
+        whole(Recognition(), given, Recognition.Parameters())
 
 
 def test_parameters_reach_the_criteria(database: Database) -> None:
     scene = Scene()
     scene.add(RECTANGLE, 20.0)
     given = inputs_of(scene, database)
-    (found,) = Recognition().compute(given, Recognition.Parameters())["candidates"]
+    (found,) = whole(Recognition(), given, Recognition.Parameters())["candidates"]
     given["models"] = replace(database, phi=5 * found["distance"])
     for scale, picked in ((1.0, True), (0.1, False)):
-        told = Recognition().compute(given, Recognition.Parameters(phi_scale=scale))
+        told = whole(Recognition(), given, Recognition.Parameters(phi_scale=scale))
         assert bool(told["candidates"]["picked"].any()) == picked
         assert told["verdict"]["verdict"] == ("pick" if picked else "rearrange")
 
@@ -195,7 +196,7 @@ def test_each_reason_names_the_knob_that_it_is_held_against(
     label = scene.add(RECTANGLE, 0.0)
     given = inputs_of(scene, database)
     given["regions"][field][label - 1] = amount
-    given |= Recognition().compute(given, Recognition.Parameters())
+    given |= whole(Recognition(), given, Recognition.Parameters())
     last = Recognition().explain(128, 128, given, Recognition.Parameters())[-1]
     assert last.verdict == "refused" and last.parameter == parameter
 
@@ -205,7 +206,7 @@ def test_an_outline_over_zeta_names_its_knob(database: Database) -> None:
     scene.add(RECTANGLE, 0.0)
     strict = replace(database, parts=tuple(replace(p, zeta=1e-6) for p in database.parts))
     given = inputs_of(scene, strict)
-    given |= Recognition().compute(given, Recognition.Parameters())
+    given |= whole(Recognition(), given, Recognition.Parameters())
     last = Recognition().explain(128, 128, given, Recognition.Parameters())[-1]
     assert (last.verdict, last.parameter) == ("refused", "zeta_scale")
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from edge_scenes import planted_operator
+from stage_outputs import given as whole
 
 from workbench_stages.edge_stack import EdgeStackStage
 from workbench_stages.edges import segmentation
@@ -375,7 +376,7 @@ def test_relative_depth_gives_regions_no_planes() -> None:
         "linking": done, "depth_m": None, "depth_relative": np.full(SHAPE, 0.4, np.float32),
         "near_camera": None,
     }  # fmt: skip
-    regions = RegionFeatures().compute(inputs, RegionFeatures.Parameters())["regions"]
+    regions = whole(RegionFeatures(), inputs, RegionFeatures.Parameters())["regions"]
     assert len(regions) == 2
     assert np.isnan(regions["elevation_m"]).all() and (regions["plane_px"] == 0).all()
 
@@ -383,7 +384,7 @@ def test_relative_depth_gives_regions_no_planes() -> None:
         width, height, K = SHAPE[1], SHAPE[0], np.diag([900.0, 900.0, 1.0])
 
     metric = inputs | {"depth_m": np.full(SHAPE, 0.7, np.float32), "near_camera": Seen()}
-    regions = RegionFeatures().compute(metric, RegionFeatures.Parameters(inset=3.0))["regions"]
+    regions = whole(RegionFeatures(), metric, RegionFeatures.Parameters(inset=3.0))["regions"]
     assert np.isfinite(regions["elevation_m"]).all()
-    small = RegionFeatures().compute(metric, RegionFeatures.Parameters(inset=9.0))["regions"]
+    small = whole(RegionFeatures(), metric, RegionFeatures.Parameters(inset=9.0))["regions"]
     assert (small["plane_px"] < regions["plane_px"]).all()
