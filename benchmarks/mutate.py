@@ -53,7 +53,8 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Room: the files in which faults are put, and which tests look at them (markers, see
 ``tests/rooms.py``), the quick ones first."""
 
-_SECONDS = 240
+_SECONDS = 600
+"""After which tests are ended, and the fault counts as seen: most likely a loop has no end."""
 _COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq,
     ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
@@ -231,8 +232,8 @@ class Copy:
             (self._site / name).symlink_to(self.root / target)
         self._importers = _importers(self.root)
 
-    def test(self, tests: str) -> bool:
-        """Whether the tests that a marker expression selects pass."""
+    def test(self, tests: str, seconds: float | None = None) -> bool:
+        """Whether the tests that a marker expression selects pass, within ``seconds``."""
         environment = os.environ | {"PYTHONPATH": str(self._site), "PYTHONDONTWRITEBYTECODE": "1"}
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
             environment[name] = "1"
@@ -244,7 +245,7 @@ class Copy:
                 env=environment,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                timeout=_SECONDS,
+                timeout=seconds,
                 start_new_session=True,
             )
         except subprocess.TimeoutExpired:
@@ -262,7 +263,7 @@ class Copy:
                 compile(path.read_bytes(), str(path), "exec")
             except SyntaxError:
                 return False
-            return all(self.test(selection) for selection in tests)
+            return all(self.test(selection, _SECONDS) for selection in tests)
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))

@@ -128,7 +128,9 @@ def test_a_saved_replay_says_what_it_was_made_from(
         for stage in stages
         for name, value in stage.Parameters().model_dump().items()
     }
-    libraries = ("numpy", "opencv-python-headless", "numba", "rerun-sdk")
+    libraries = (
+        "numpy", "opencv-python-headless", "scipy", "scikit-image", "numba", "rerun-sdk"
+    )  # fmt: skip
     assert found == {
         "bench": [version("defocus-workbench")],
         "recording": [digest(scene)],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -756,12 +757,9 @@ def test_workers_may_die_three_times_in_a_row(monkeypatch: pytest.MonkeyPatch, d
 
 
 def test_a_cluster_that_is_not_installed_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> Any:
-        raise ImportError(name)
-
-    monkeypatch.setattr(engines.importlib, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "distributed", None)
     tasks = [Task(0, 0, 0, 1, ())]
-    with pytest.raises(UsageError, match=r"pip install 'defocus-workbench\[cluster\]'"):
+    with pytest.raises(DataError, match=r"pip install 'defocus-workbench\[cluster\]'"):
         list(engines.outcomes(None, tasks, 2, "tcp://x"))  # type: ignore[arg-type]
 
 
