@@ -59,7 +59,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(rooms.FILES[item.path.stem])
         if "browser" in item.keywords:
             item.add_marker("slow")
-    if config.getoption("dist", "no") == "no":
+    # Told so in the processes of pytest-xdist alone.
+    if not getattr(config.option, "loadgroup", False):
         return
     # What a file makes once is made in one process; what draws with the processor alone is drawn
     # in one as well, for two at once would take turns.
@@ -148,7 +149,8 @@ MACHINE: dict[str, Callable[[], str]] = {
 def missing(item: pytest.Item) -> str:
     """Why a test cannot run on this machine; empty where it can."""
     reasons = [find() for marker, find in MACHINE.items() if item.get_closest_marker(marker)]
-    named = [name for marker in item.iter_markers("needs") for name in marker.args]
+    # Once each, and those of a test before those of its file: some import only in their order.
+    named = dict.fromkeys(name for marker in item.iter_markers("needs") for name in marker.args)
     return "; ".join(filter(None, [*reasons, *map(missing_module, named)]))
 
 

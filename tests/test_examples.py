@@ -57,9 +57,9 @@ def test_examples_are_numbered_without_gaps() -> None:
     assert [int(path.name[:2]) for path in EXAMPLES] == list(range(1, len(EXAMPLES) + 1))
 
 
+@pytest.mark.needs("setuptools")
 def test_the_package_with_a_stage_installs_and_its_stage_runs(tmp_path: Path) -> None:
     """Through the entry point, as a user's own package would; without a network."""
-    pytest.importorskip("setuptools", reason="building a package needs setuptools")
     source, target = tmp_path / "source", tmp_path / "installed"
     shutil.copytree(FOLDER / "stage_package", source)
     target.mkdir()

@@ -19,9 +19,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import typer
 from waiting import PATIENCE_S, until_running
 
 from workbench.recording import Frame
+from workbench.session import Options
 from workbench_stages.depth_cloud import DepthCloud
 from workbench_stages.focus_maps import FocusMaps
 from workbench_stages.registration import Registration
@@ -77,12 +79,21 @@ def assert_whole(rrd: Path) -> None:
 # -- a saved replay -------------------------------------------------------------------------------
 
 
-def test_a_saved_replay_is_whole_and_holds_every_result(
-    bench: Command, scene: Path, tmp_path: Path
-) -> None:
-    assert bench("replay", scene, "--save", "a.rrd", "--frames", "3:6").code == 0
-    assert_whole(tmp_path / "a.rrd")
-    shown = frames_of(tmp_path / "a.rrd")
+@pytest.fixture(scope="module")
+def saved(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A saved replay of frames 3 to 5 of the committed scene."""
+    from workbench.commands import replay
+
+    path = tmp_path_factory.mktemp("saved") / "a.rrd"
+    with pytest.raises(typer.Exit) as ended:
+        replay.run(Options(scene, frames=(3, 6)), path, None, False, None, "640x480")
+    assert ended.value.exit_code == 0
+    return path
+
+
+def test_a_saved_replay_is_whole_and_holds_every_result(saved: Path) -> None:
+    assert_whole(saved)
+    shown = frames_of(saved)
     once = {"bench/parameters", "bench/defects", "bench/pipeline"}
     assert {entity for entity in EXPECTED if entity not in shown} == set()
     assert {entity: shown[entity] for entity in EXPECTED - once if shown[entity] != {3, 4, 5}} == {}
@@ -183,9 +194,8 @@ def test_the_provenance_follows_each_thing_that_is_changed(
     assert changes(told()) == {"plain"}
 
 
-def test_a_saved_replay_carries_its_layout(bench: Command, scene: Path, tmp_path: Path) -> None:
-    assert bench("replay", scene, "--save", "a.rrd", "--frames", "0:1").code == 0
-    printed = rerun("rrd", "print", tmp_path / "a.rrd").stdout
+def test_a_saved_replay_carries_its_layout(saved: Path) -> None:
+    printed = rerun("rrd", "print", saved).stdout
     assert "Blueprint," in printed and "/viewport" in printed
 
 
