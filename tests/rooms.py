@@ -87,6 +87,7 @@ FILES = {
     "test_stage_figures": "pipeline",
     "test_stage_in_parts": "pipeline",
     "test_surfaces": "matching",
+    "test_surroundings": "cli",
     "test_sweep": "sweep",
     "test_sweep_axes": "sweep",
     "test_sweep_gallery": "sweep",

@@ -114,7 +114,8 @@ def test_a_package_that_is_not_installed_names_the_extra(name: str) -> None:
     with pytest.raises(DataError) as told:
         required(name, "a pile", "simulate")
     assert str(told.value) == (
-        f"a pile needs {name}, which is not installed: pip install 'defocus-workbench[simulate]'"
+        f"a pile needs {name}, which is not installed: "
+        f"{sys.executable} -m pip install 'defocus-workbench[simulate]'"
     )
 
 

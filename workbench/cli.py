@@ -5,6 +5,7 @@ Exit codes: 0 done, 1 the data or the run failed, 2 wrong usage.
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -344,6 +345,7 @@ def calibrate(
             help="The recording of known planes; with --from-optics, one of any scene that "
             "tells the images' size.",
             metavar="REC",
+            parser=located,
         ),
     ] = None,
     from_optics: Annotated[
@@ -352,6 +354,7 @@ def calibrate(
             "--from-optics",
             help="Calibrate from the lens's data alone: a rig.toml, or a recording that has a rig.",
             metavar="RIG",
+            parser=located,
         ),
     ] = None,
     image_size: Annotated[
@@ -722,6 +725,10 @@ def teach(
 def main() -> None:
     """Run the command line; a user's mistake is one line, never a traceback."""
     interrupts.install()
+    for stream in (sys.stdout, sys.stderr):
+        # A terminal of few characters shows the others as question marks.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         code = app(standalone_mode=False) or 0
     except (KeyboardInterrupt, typer.Abort):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import Any
 
 from workbench.errors import DataError, one_line
@@ -22,7 +23,8 @@ def required(module: str, what: str, extra: str) -> Any:
         if error.name != module.partition(".")[0]:
             raise DataError(f"{what} needs {module}, which cannot be loaded: {error}") from error
         raise DataError(
-            f"{what} needs {module}, which is not installed: pip install '{DISTRIBUTION}[{extra}]'"
+            f"{what} needs {module}, which is not installed: "
+            f"{sys.executable} -m pip install '{DISTRIBUTION}[{extra}]'"
         ) from error
     except (ImportError, OSError) as error:
         says = f"{what} needs {module}, which cannot be loaded: {one_line(error)}"

@@ -6,6 +6,7 @@ handed over as it comes.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -53,6 +54,14 @@ def _on_machine(job: Job, tasks: Sequence[Task], workers: int) -> Iterator[Outco
     from joblib.externals.loky import get_reusable_executor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+    try:
+        # Workers are told of their tasks through semaphores, which some systems do not have.
+        multiprocessing.Semaphore(0)
+    except (ImportError, OSError) as error:
+        raise DataError(
+            f"--workers {workers}: this system has no shared memory for processes (/dev/shm): "
+            f"{one_line(error)}; --workers 1 needs none"
+        ) from error
     waiting = {task.number: task for task in tasks}
     deaths = 0
     try:

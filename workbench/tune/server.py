@@ -8,6 +8,7 @@ ones in a cookie that is kept from scripts and from other sites.
 from __future__ import annotations
 
 import asyncio
+import logging
 import secrets
 import threading
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from workbench.errors import DataError, one_line
 from workbench.viewer import LOOPBACK
 
 MAX_BODY_BYTES = 256 << 10
@@ -269,7 +271,10 @@ def new_token() -> str:
 
 
 def serve(app: Any, token: str, port: int, on_ready: Callable[[], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, on loopback alone."""
+    """Serve until Ctrl-C or SIGTERM, on loopback alone.
+
+    Raises :class:`DataError` where the server does not start.
+    """
     import uvicorn
 
     config = uvicorn.Config(
@@ -284,7 +289,22 @@ def serve(app: Any, token: str, port: int, on_ready: Callable[[], None]) -> None
         server_header=False,
     )
     server = _Server(config, on_ready)
-    server.run()
+    try:
+        server.run()
+    except SystemExit as error:
+        why = server.trouble or "its server did not start"
+        raise DataError(f"the page cannot be served on port {port}: {why}") from error
+
+
+class _Told(logging.Handler):
+    """Keeps the first error that is logged, in one line."""
+
+    first = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        says = record.getMessage().strip().splitlines()[-1] if error is None else one_line(error)
+        self.first = self.first or says
 
 
 def _server_class() -> type:
@@ -294,9 +314,23 @@ def _server_class() -> type:
         def __init__(self, config: uvicorn.Config, on_ready: Callable[[], None]) -> None:
             super().__init__(config)
             self._on_ready = on_ready
+            self.trouble = ""
 
         async def startup(self, sockets: Any = None) -> None:
-            await super().startup(sockets)
+            # The server logs what went wrong, and says it to nobody else.
+            told = _Told(logging.ERROR)
+            logger = logging.getLogger("uvicorn.error")
+            before = logger.level, logger.propagate
+            logger.addHandler(told)
+            logger.setLevel(logging.ERROR)
+            logger.propagate = False
+            try:
+                await super().startup(sockets)
+            finally:
+                logger.removeHandler(told)
+                logger.setLevel(before[0])
+                logger.propagate = before[1]
+                self.trouble = told.first
             if self.started:
                 self._on_ready()
 
