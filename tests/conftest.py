@@ -59,6 +59,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(rooms.FILES[item.path.stem])
         if "browser" in item.keywords:
             item.add_marker("slow")
+        if "started" in getattr(item, "fixturenames", ()):
+            item.add_marker("process")
     # Told so in the processes of pytest-xdist alone.
     if not getattr(config.option, "loadgroup", False):
         return
