@@ -6,8 +6,7 @@ its room there and says which faults none of them saw:
 
     python benchmarks/mutate.py --sample 300 --seed 1 --workers 2 --to mutants.json
 
-By hand or at night, not in CI: a fault takes ten seconds or so.  `benchmarks/mutants.md` has the
-survivors of the latest run, judged one by one.
+By hand or at night, not in CI: a fault takes ten seconds or so.
 """
 
 from __future__ import annotations
