@@ -79,10 +79,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def missing_browser() -> str:
     """Why there is no browser for the tests of the pages; empty where there is one."""
-    reason = missing_module("playwright.sync_api")
-    if not reason and chromium() is None:
-        reason = "there is no Chromium (playwright install chromium, or the system's)"
-    return reason
+    if reason := missing_module("playwright.sync_api"):
+        return reason
+    try:
+        found = chromium()
+    except Exception as error:
+        return f"Playwright's driver does not start: {str(error).splitlines()[0]}"
+    return "" if found else "there is no Chromium (playwright install chromium, or the system's)"
 
 
 @functools.cache
