@@ -142,7 +142,7 @@ class Registration(Stage):
             moved = warp(far_saturated.astype(np.float32), similarity)
             saturated |= moved > 0.1
         # Infinity as well: the greatest float would drown the light of the whole image.
-        near, far = (np.nan_to_num(image, posinf=0, neginf=0) for image in (near, far))
+        near, far = (np.nan_to_num(image, copy=False, posinf=0, neginf=0) for image in (near, far))
         far = warp(far, similarity)
 
         gain_drift = 1.0

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declared_artifacts import CODES, LABELS, MAP, MASK, POINTS, THING
 
 from workbench.differences import (
     Difference,
@@ -23,12 +24,6 @@ from workbench.differences import (
 )
 from workbench.stage import Artifact
 
-MASK = Artifact("mask", "bool", "H W")
-CODES = Artifact("codes", "uint8", "H W")
-LABELS = Artifact("labels", "int32", "H W", names_regions=True)
-MAP = Artifact("map", "float32", "H W", "mm")
-POINTS = Artifact("points", "float32", "N 3")
-THING = Artifact("thing")
 NAN, INF = math.nan, math.inf
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from declared_artifacts import CODES, LABELS, MAP, MASK, POINTS, THING
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -24,14 +25,6 @@ from workbench.differences import (
 from workbench.plugins import find_stages
 from workbench.recording import Frame
 from workbench.settings import adjusted, resolve
-from workbench.stage import Artifact
-
-MASK = Artifact("mask", "bool", "H W")
-CODES = Artifact("codes", "uint8", "H W")
-LABELS = Artifact("labels", "int32", "H W", names_regions=True)
-MAP = Artifact("map", "float32", "H W", "mm")
-POINTS = Artifact("points", "float32", "N 3")
-THING = Artifact("thing")
 
 SHAPE = (6, 9)
 VALUES = {

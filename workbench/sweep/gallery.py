@@ -106,8 +106,8 @@ def write(sweep: Sweep, cache: Cache, command: Command) -> int:
 def served(folder: Path) -> Iterator[str]:
     """A server on loopback for the gallery in ``folder``; yields the address that shows it.
 
-    Needs Rerun's catalog (:func:`require_catalog`).  Raises :class:`DataError` where it cannot
-    serve the gallery.
+    Needs Rerun's catalog, the extra ``gallery``.  Raises :class:`DataError` where it cannot serve
+    the gallery.
     """
     files = sorted((folder / GALLERY).glob("*.rrd"))
     try:
